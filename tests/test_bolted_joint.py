@@ -60,6 +60,8 @@ def test_tightened_where_all_points_of_a_joint_slip() -> None:
         made.load(load)
         step = made.problem.solve()
         made.problem.commit()
+        assert all(step.contacts[name].stick == 0 for name in ("head", "nut"))
+        assert step.attempts[0].method == "lbfgs"  # the default though contact holds the bolt
         assert max(each.worst for each in step.verdict.small_displacement_error.values()) < 0.01
         forces = [contact.resultants().normal_force for contact in made.contacts]
         assert forces == pytest.approx([forces[1]] * 3, rel=1e-3)

@@ -190,6 +190,7 @@ class NoDistance(Bubble):
         return fc.Sample(self.scale * found.distance, normal, found.curvature)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize(("scale", "tilt"), [(1.0, 0.0), (2.0, 0.0), (0.9, 0.0), (1.0, 0.1)])
 def test_numbers_that_are_no_distance(scale, tilt, kinematics):

@@ -14,6 +14,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from fenics_contact.checks.kinematics import LinearSprings
 from scenes.blocks import BOTTOM, TOP, Block, block, block_mesh
 from scenes.comparing import at_points, close
 from scenes.elasticity import displacement_space, stress
@@ -281,3 +282,35 @@ def test_the_error_budget_has_it():
     told = fc.estimate_errors(problem, plane).parts["kinematics"]["normal force"]
     assert close(told, dragged - exact, 1 / 3)
     assert abs(dragged - exact) > 1e-3 * exact
+
+
+@pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
+@pytest.mark.parametrize(
+    ("cell", "transverse"), [("triangle", None), ("tetrahedron", None), ("tetrahedron", 0.1)]
+)
+def test_friction_that_turns_with_slip_is_part_of_the_estimate(transverse, cell, enforcement):
+    """Its stiffness along Γc at slipping points, which alone may hold a body in space.
+
+    Reference: the derivative of the law's traction by UFL, to 1e-9 of the stiffness; in the plane
+    there is none of it.
+    """
+    d = 2 if cell == "triangle" else 3
+    scene = block(cell, n=3, E=1e3)
+    shift = fem.Constant(scene.mesh, np.zeros(d))
+    options = {"transverse_friction": transverse, "direction": np.eye(d)[0]} if transverse else {}
+    law = fc.Coulomb(0.3, 1e4, 1e3, **options)
+    bcs = [scene.hold(TOP, i, -0.01 if i == d - 1 else 0.0) for i in range(d)]
+    given = {"displacement": shift, "enforcement": enforcement}
+    problem, contact = scene.problem(law, bcs, contact=given)
+    problem.solve()
+    problem.commit()
+    shift.value[:2] = 0.02, 0.01 * (d - 2)
+    problem.solve()
+    slips, normal = contact.status == fc.Status.SLIP, contact.values.normal
+    assert scene.mesh.comm.allreduce(int(slips.sum())) > 0
+    flat = np.eye(d) - np.einsum("qi,qj->qij", normal, normal)
+    found = flat @ LinearSprings.of(contact).stiffness @ flat
+    exact = -flat @ contact.acting.tangent().by_jump @ flat
+    largest = COMM.allreduce(np.abs(exact[slips]).max(initial=0.0), op=MPI.MAX)
+    assert (largest > 1.0) == (d == 3)
+    assert COMM.allreduce(np.abs((found - exact)[slips]).max(initial=0.0), op=MPI.MAX) < 1e-9 * 1e3

@@ -69,13 +69,9 @@ class LinearSprings:
                 along = -np.sum(borne * normal, axis=1)
                 stretch += (along / contact.normal_stiffness)[:, None] * normal
         if law.has_tangential:
-            k_t, length = contact.tangential_stiffness, np.linalg.norm(tangential, axis=1)
+            k_t = contact.tangential_stiffness
             stiffness += np.where((status == Status.STICK)[:, None, None], k_t, 0.0)
-            # A slipping point's friction turns with its slip: in space that alone may hold a body.
-            side = tangential / np.where(length > 0, length, 1.0)[:, None]
-            across = np.eye(d) - np.einsum("qi,qj->qij", side, side)
-            secant = np.where(status == Status.SLIP, values.friction_secant, 0.0)
-            stiffness += secant[:, None, None] * (across @ k_t @ across)
+            stiffness += _turning_stiffness(contact)
             if is_regularised(contact.law):
                 # K_t has no inverse along the normal, where nothing acts: any stiffness will do.
                 along = np.einsum("q,qi,qj->qij", values.parameters["k_t"], normal, normal)
@@ -86,6 +82,27 @@ class LinearSprings:
     def change(self, jump: Array) -> Array:
         """Of the traction, by a change of the relative displacement, (n_points, gdim)."""
         return -np.einsum("qij,qj->qi", self.stiffness, jump)
+
+
+def _turning_stiffness(contact: Contact) -> Array:
+    """Stiffness of friction that turns with the direction of slip, (n_points, gdim, gdim).
+
+    Of slipping points in space, where it may be all that holds a body; in the plane it is none.
+    That of circular and elliptic friction cones; polygons have it by their corners, on average.
+    """
+    values, d = contact.values, contact.values.normal.shape[1]
+    stiffness: Array = np.zeros((len(values.normal), d, d))
+    slips = contact.status == Status.SLIP
+    if d == 2 or not slips.any():
+        return stiffness
+    traction, k_t = values.traction[slips], values.tangential_stiffness[slips]
+    stretch = np.einsum("qij,qj->qi", np.linalg.pinv(k_t, hermitian=True), traction)
+    energy = np.sum(traction * stretch, axis=1)
+    along = np.einsum("qi,qj->qij", traction, traction)
+    along /= np.where(energy > 0, energy, np.inf)[:, None, None]
+    secant = np.where(energy > 0, values.friction_secant[slips], 0.0)
+    stiffness[slips] = secant[:, None, None] * (k_t - along)
+    return stiffness
 
 
 @dataclass(frozen=True)

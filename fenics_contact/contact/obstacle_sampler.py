@@ -17,9 +17,9 @@ from fenics_contact.types import Array
 
 __all__ = ["ObstacleSampler"]
 
-# Of the distance, the step of differences: to an edge the distance falls by 2.5 % less sideways.
+# Step of the differences by the distance: sideways to an edge the slope is half of it.
 _STEP = 0.05
-# The least step, by the coordinates: what is lost in their round-off is 1e-5 of it.
+# Least step by the coordinates: their round-off is 1e-5 of it.
 _LEAST_STEP = 1e-11
 
 
@@ -101,16 +101,18 @@ class ObstacleSampler:
         Args:
             place: In the obstacle's frame, (n, gdim) (length).
         """
-        _, normal, gradient = self._sample(place, 1.0)
+        _, normal, gradient = self._sample(place, 1.0, gradient=True)
         return np.asarray(np.linalg.norm(gradient + normal, axis=1))
 
-    def _sample(self, place: Array, time: Array | float) -> tuple[Array, Array, Array]:
-        """See `sample`; the gradient of the distance, too."""
+    def _sample(
+        self, place: Array, time: Array | float, *, gradient: bool = False
+    ) -> tuple[Array, Array, Array]:
+        """See `sample`; the gradient of the distance, too, if wanted or at no cost."""
         if isinstance(self._obstacle, SampledObstacle):
             with collective_errors(self._comm):
                 found = self._obstacle.sample_checked(place)
-                gradient = _gradient(self._obstacle, place, found)
-            return found.distance, found.normal, gradient
+                slope = _gradient(self._obstacle, place, found) if gradient else -found.normal
+            return found.distance, found.normal, slope
         n, d = place.shape
         if self._evaluate is None:
             self._evaluate = PointEvaluator(self._quadrature, self._expressions)
@@ -118,7 +120,7 @@ class ObstacleSampler:
         # The form has as many slots as Γc has points: the places go through it in batches.
         size = max(self._quadrature.n_points, 1)
         batches = max(self._comm.allgather(-(-n // size) if self._quadrature.n_points else 0))
-        distance, normal, gradient = np.zeros(n), np.zeros((n, d)), np.zeros((n, d))
+        distance, normal, slope = np.zeros(n), np.zeros((n, d)), np.zeros((n, d))
         for k in range(batches):
             some = slice(k * size, (k + 1) * size)
             for field, rows in ((self._place, place[some]), (self._time, time[some])):
@@ -126,8 +128,8 @@ class ObstacleSampler:
                 field.x.scatter_forward()
             values, m = self._evaluate(), len(place[some])
             distance[some], normal[some] = values["gap"][:m], values["normal"][:m]
-            gradient[some] = values["gradient"][:m]
-        return distance, normal, gradient
+            slope[some] = values["gradient"][:m]
+        return distance, normal, slope
 
 
 def _values(constants: Sequence[fem.Constant]) -> Array:
@@ -135,35 +137,34 @@ def _values(constants: Sequence[fem.Constant]) -> Array:
     return np.concatenate([np.zeros(0), *(np.ravel(c.value) for c in constants)])
 
 
-def _gradient(obstacle: SampledObstacle, x: Array, at: Sample) -> Array:
+def _gradient(obstacle: SampledObstacle, x: Array, sample: Sample) -> Array:
     """Gradient of a distance known in numbers, by differences, (n, gdim). Not collective.
 
-    Towards the closest point of the surface a distance falls by the way, and sideways it does not
-    change on one side at least, whatever edges the surface has. Where a step that is short by
-    the distance is lost in the round-off of the place the gradient is minus the normal.
+    Towards the closest point of the surface the slope of a distance is -1, and sideways it is 0 on
+    one side at least, whatever edges the surface has. It is minus the normal where the step would
+    be below the round-off of the coordinates.
 
     Args:
         obstacle: That has the distance.
         x: Where, (n, gdim) (length).
-        at: What was sampled there.
+        sample: What it returned there.
     """
-    length = np.linalg.norm(at.normal, axis=1, keepdims=True)
-    unit = at.normal / np.where(length > 0, length, np.nan)
-    gradient = -unit
-    step = _STEP * np.abs(at.distance)
-    told = step > _LEAST_STEP * np.abs(x).max(axis=1, initial=0.0)
-    told &= np.isfinite(unit[:, 0])
-    x, unit, distance, step = x[told], unit[told], at.distance[told], step[told]
-    # The rows after the normal are of the tangent plane.
-    axes = np.linalg.svd(unit[:, None, :])[2]
+    length = np.linalg.norm(sample.normal, axis=1, keepdims=True)
+    unit = sample.normal / np.where(length > 0, length, np.nan)
+    gradient, step = -unit, _STEP * np.abs(sample.distance)
+    resolved = step > _LEAST_STEP * np.abs(x).max(axis=1, initial=0.0)
+    resolved &= np.isfinite(unit[:, 0])
+    x, unit, step = x[resolved], unit[resolved], step[resolved]
+    distance = sample.distance[resolved]
+    axes = np.linalg.svd(unit[:, None, :])[2]  # the rows after the first are tangents
     axes[:, 0] = np.copysign(1.0, distance)[:, None] * unit
     found = np.zeros_like(unit)
     for k in range(x.shape[1]):
-        rate: Array = np.full(len(x), np.inf)
-        for way in (step, -step) if k else (step,):
-            moved = obstacle.sample_checked(x + way[:, None] * axes[:, k]).distance
-            other = (moved - distance) / way
-            rate = np.where(np.abs(other) < np.abs(rate), other, rate)
-        found += rate[:, None] * axes[:, k]
-    gradient[told] = found
+        slope: Array = np.full(len(x), np.inf)
+        for signed in (step, -step) if k else (step,):
+            moved = obstacle.sample_checked(x + signed[:, None] * axes[:, k]).distance
+            one_sided = (moved - distance) / signed
+            slope = np.where(np.abs(one_sided) < np.abs(slope), one_sided, slope)
+        found += slope[:, None] * axes[:, k]
+    gradient[resolved] = found
     return gradient

@@ -230,7 +230,7 @@ class PointValues:
 
     @property
     def friction_secant(self) -> Array:
-        """Share of K_t that the secant of friction is in the increment, (n_points,): 1 at stick."""
+        """Secant stiffness of friction relative to K_t, (n_points,): 1 at sticking points."""
         stuck = self.old_traction - np.einsum(
             "qij,qj->qi", self.tangential_stiffness, self.increment
         )

@@ -294,10 +294,10 @@ class Solver:
     def _choose_method(self) -> str:
         """Newton's method, or L-BFGS.
 
-        L-BFGS is for linear bodies in space on all unknowns, where a tangent of all bodies costs
-        dozens of iterations with the factors of each: a ball pressed on a block, of 32,000 to a
-        million unknowns, takes 1.2 to 1.7 linear solves by multigrid so, and two plates under a
-        bolt a fifth of the time of Newton's method.
+        L-BFGS is for linear bodies in space on all unknowns, where factors of a matrix cost dozens
+        of iterations, and it needs one in a round, not one in every iteration: a ball pressed on a
+        block, of 32,000 to a million unknowns, takes 1.2 to 1.7 linear solves by multigrid so, and
+        two plates under a bolt a fifth of the time of Newton's method.
         """
         full = self._full
         if self.condensed or not full.bulk.linear:

@@ -1,4 +1,4 @@
-"""Bodies that nothing loads or touches any more, farther away than anything has pushed them."""
+"""Bodies ejected by a Newton step: no force acts on them, and none has moved them there."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from collections.abc import Sequence
 import numpy as np
 
 from fenics_contact.parallel import global_sum
-from fenics_contact.systems.balance import MOST_EXCUSED, InitialForces
+from fenics_contact.systems.balance import MOST_EXCUSED, InitialForces, by_body
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.tolerances import FLAT
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Mask
 
 __all__ = ["find_ejected_bodies"]
 
-# How many times as far as all else a body may go. Blocks thrown out from between two others went
-# ten times as far; one that is let go springs back by as much as it changes its shape.
-_FAR = 3.0
-# Mean square of the normals along a direction, from which on contact pushes along it: a slope of
-# one in thirty.
-_PUSHED = 1e-3
+# Largest displacement of a body by that of all others. Blocks ejected from between two others had
+# ten times as much; one that is let go springs back by as much as it changes its shape.
+_MAX_RATIO = 3.0
+# Mean square of the contact normals along a direction, from which on contact pushes along it: a
+# slope of one in thirty.
+_MIN_MEAN_SQUARE = 1e-3
 
 
 def find_ejected_bodies(
@@ -30,13 +30,12 @@ def find_ejected_bodies(
     began: Array,
     start: InitialForces,
 ) -> dict[str, tuple[float, float, float]]:
-    """Bodies that have gone away, and on which no force acts. Collective.
+    """Find bodies that no force acts on, far from where any has moved them. Collective.
 
-    Such a body is in equilibrium wherever it is, and a step of an iteration that throws it out of
-    sight of all others leaves no residual. Along the normals of its contacts bodies push each other
-    as far as they spring back, or as wedges do, many times as far. Along all other directions only
-    friction takes a body along: as far as what is near it goes, obstacles and prescribed values
-    included.
+    Such a body is in equilibrium wherever it is, and a Newton step that ejects it leaves no
+    residual. Along the contact normals bodies push each other as far as they spring back, or as
+    wedges do, many times as far. Along all other directions only friction takes a body along, as
+    far as what is near it moves: other bodies, obstacles, prescribed values.
 
     Args:
         full: The system at its present state.
@@ -46,49 +45,49 @@ def find_ejected_bodies(
         start: Forces at that state.
 
     Returns:
-        By its name how far a body has gone, how far it may, and how far anything else that it may
-        touch has, or its own change of shape (length).
+        By the name of a body its translation in the increment along directions that no contact
+        normal has a part in, the limit of it, and the largest displacement nearby, or change of its
+        shape (length).
     """
-    scales = full.scales
-    looked_at = motions.unconstrained_bodies()
-    if not looked_at.any():
+    scales, n = full.scales, full.scales.n_bodies
+    loose = motions.unconstrained_bodies()
+    if not loose.any():
         return {}
     # What has a load is not in equilibrium, and may be on its way to be set down.
-    forces = scales.sums(sum((np.abs(f) for f in contacts), np.abs(full.load)))
-    borne = start.pushes.sum(axis=0)[: scales.n_bodies]
-    gone = looked_at & (scales.is_unloaded(forces) | (forces <= MOST_EXCUSED * borne))
-    if not gone.any():
+    forces = by_body(full.unknowns.comm, [*contacts, full.load], full.label, full.n_bodies)
+    force, committed = (each.sum(axis=0)[:n] for each in (forces, start.pushes))
+    unloaded = loose & (scales.is_unloaded(force) | (force <= MOST_EXCUSED * committed))
+    if not unloaded.any():
         return {}
     change, bodies = full.state() - began, motions.of_bodies[:, : full.gdim]
     sums = np.column_stack([bodies @ change, bodies[:, 0].sum(axis=1)])
     sums = global_sum(full.unknowns.comm, sums)
-    ways = sums[:, :-1] / sums[:, -1:]
-    # Of a body that has gone away it is the change of its shape, its turn, or what is prescribed.
-    shift = np.where(gone[:, None], ways, 0.0)
-    others = change - np.where(full.constrained, 0.0, np.einsum("bd,bdi->i", shift, bodies))
-    most = scales.largest(np.where(np.any(bodies != 0.0, axis=(0, 1)), others, 0.0))
-    obstacles = _obstacle_motions(full, change)
-    nearby = np.where(gone, obstacles, np.maximum(most, obstacles))
-    rest = np.array(
-        [
-            nearby[scales.coupled_with(b)].max(initial=max(most[b], obstacles[b]))
-            for b in range(scales.n_bodies)
-        ]
-    )
-    limit = np.maximum(_FAR * rest, FLAT * scales.size)
-    if not np.any(gone & (np.linalg.norm(ways, axis=1) > limit)):
+    if not np.isfinite(sums).all():
+        return {}  # a diverged state has no residual either
+    translation = sums[:, :-1] / sums[:, -1:]
+    # Of an unloaded body the change of its shape, its rotation, and what is prescribed.
+    shift = np.where(unloaded[:, None], translation, 0.0)
+    other = change - np.where(full.constrained, 0.0, np.einsum("bd,bdi->i", shift, bodies))
+    largest = scales.largest(np.where(np.any(bodies != 0.0, axis=(0, 1)), other, 0.0))
+    obstacles = _obstacle_displacements(full, change)
+    around = np.where(unloaded, obstacles, np.maximum(largest, obstacles))
+    nearby = np.maximum(largest, obstacles)
+    for body in np.flatnonzero(unloaded):
+        nearby[body] = around[scales.coupled_with(int(body))].max(initial=nearby[body])
+    limit = np.maximum(_MAX_RATIO * nearby, FLAT * scales.size)
+    if not np.any(unloaded & (np.linalg.norm(translation, axis=1) > limit)):
         return {}
-    way = np.linalg.norm(np.einsum("bij,bj->bi", _not_pushed(full, borne), ways), axis=1)
-    found = np.flatnonzero(gone & (way > limit))
-    rows = np.stack([way, limit, rest], axis=1).tolist()
-    return {full.parts.names[b]: tuple(rows[b]) for b in found}
+    projection = _off_contact_normals(full, scales.is_unloaded(committed))
+    aside = np.linalg.norm(np.einsum("bij,bj->bi", projection, translation), axis=1)
+    rows = np.stack([aside, limit, nearby], axis=1).tolist()
+    ejected = np.flatnonzero(unloaded & (aside > limit))
+    return {full.parts.names[body]: tuple(rows[body]) for body in ejected}
 
 
-def _obstacle_motions(full: FullSystem, change: Array) -> Array:
-    """How far rigid obstacles have moved at the points of every body, (n_bodies,) (length).
+def _obstacle_displacements(full: FullSystem, change: Array) -> Array:
+    """Largest displacement of rigid obstacles at the points of every body, (n_bodies,) (length).
 
-    Collective. It is what the displacement relative to the obstacle has not changed by with that
-    of the body.
+    Since the last commit: that of the body minus that relative to the obstacle. Collective.
 
     Args:
         full: The system at its present state.
@@ -98,45 +97,50 @@ def _obstacle_motions(full: FullSystem, change: Array) -> Array:
     found: Array = np.zeros(scales.n_bodies)
     of_bodies = np.where(full.label < scales.n_bodies, change, 0.0)
     for number, operator in enumerate(full.operators):
-        opposite = operator.contact.opposite
-        if not opposite.follows:
-            relative = operator.contact.values.jump - opposite.committed_jump
-            motion = np.linalg.norm(operator.jump(of_bodies) - relative, axis=1)
-            found = np.maximum(found, scales.largest_at_points(number, motion))
+        contact, opposite = operator.contact, operator.contact.opposite
+        if opposite.is_rigid:
+            # Within an iteration the values of the contact may be those of another state.
+            opposite.update()
+            relative = contact.acting.own.evaluate()["jump"] - opposite.committed_jump
+            displacement = operator.jump(of_bodies) - opposite.turned(relative)
+            length = np.linalg.norm(displacement, axis=1)
+            found = np.maximum(found, scales.largest_at_points(number, length))
     return found
 
 
-def _not_pushed(full: FullSystem, borne: Array) -> Array:
-    """Projection of every body on the directions along which no contact pushes it. Collective.
+def _off_contact_normals(full: FullSystem, unloaded: Mask) -> Array:
+    """Projections on the directions that the contact normals of a body have no part in. Collective.
 
-    By the normals of the points that bore force at the last commit, or of all that have an
-    opposite point if none of the body did.
+    Of its points that transmitted force at the last commit, on either side; of all that had an
+    opposite point if none did.
 
     Args:
         full: The system.
-        borne: Contact force on every body at the last commit, (n_bodies,) (force).
+        unloaded: Bodies without contact force at the last commit, (n_bodies,).
 
     Returns:
         Array (n_bodies, gdim, gdim).
     """
     n, d = full.scales.n_bodies, full.gdim
-    normals: Array = np.zeros((2, n, d, d))
+    squares: Array = np.zeros((2, n, d, d))
     for number, operator in enumerate(full.operators):
         contact = operator.contact
         points = contact.states.committed.points or contact.values
-        known = (points.paired > 0) & np.isfinite(points.normal).all(axis=1)
+        known = np.isfinite(points.normal).all(axis=1) & np.isfinite(points.normal_traction)
+        known &= points.paired > 0
         normal = np.where(known[:, None], points.normal, 0.0)
         area = np.where(known, contact.measure, 0.0)
+        force = area * np.where(known, np.abs(points.normal_traction), 0.0)
         products = np.einsum("qi,qj->qij", normal, normal)
-        own, other = full.scales.bodies_at_points(operator, number)
-        for which, weight in enumerate((area * np.abs(points.normal_traction), area)):
-            np.add.at(normals[which], own, weight[:, None, None] * products)
-            met = (other != own) & (other < n)
-            np.add.at(normals[which], other[met], weight[met, None, None] * products[met])
-    normals = global_sum(full.unknowns.comm, normals)
-    unloaded = full.scales.is_unloaded(borne)
-    chosen = np.where(unloaded[:, None, None], normals[1], normals[0])
+        own, opposite = full.scales.sides[number]
+        # A body that a contact couples with itself counts once.
+        for body, counts in ((own, own < n), (opposite, (opposite != own) & (opposite < n))):
+            for which, weight in enumerate((force, area)):
+                share = weight[counts, None, None] * products[counts]
+                np.add.at(squares[which], body[counts], share)
+    squares = global_sum(full.unknowns.comm, squares)
+    chosen = np.where(unloaded[:, None, None], squares[1], squares[0])
     total = np.trace(chosen, axis1=1, axis2=2)[:, None, None]
-    squares, axes = np.linalg.eigh(chosen / np.where(total > 0, total, 1.0))
-    axes = np.where((squares < _PUSHED)[:, None, :], axes, 0.0)
+    mean, axes = np.linalg.eigh(chosen / np.where(total > 0, total, 1.0))
+    axes = np.where((mean < _MIN_MEAN_SQUARE)[:, None, :], axes, 0.0)
     return np.asarray(axes @ axes.swapaxes(1, 2))

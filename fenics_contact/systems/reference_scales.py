@@ -48,6 +48,8 @@ class ReferenceScales:
         group: Number of the group of coupled parts that a part belongs to, (n_parts,).
         touching: Which bodies a contact touches, with the pairs at the start of the increment,
             (n_contacts, n_bodies).
+        sides: Of every contact the parts on both sides of this rank's points, with these pairs,
+            (n_points,) each; the same twice where the obstacle is rigid, or nothing is opposite.
         held: Which parts Dirichlet conditions, or springs of the bulk, hold against every rigid
             motion, (n_parts,).
     """
@@ -98,6 +100,7 @@ class ReferenceScales:
         self._turning = n_bodies + np.flatnonzero(turns)
         self.held: Mask = np.ones(n_bodies + n_motions, dtype=np.bool_)
         self._own = [body_of_points(contact, space, body) for contact in contacts]
+        self.sides: list[tuple[Index, Index]] = []
         self._coupled: list[int] | None = None  # numbers of the pairs whose coupling was found
 
     @property
@@ -168,11 +171,13 @@ class ReferenceScales:
 
     def _couple(self, operators: Sequence[ContactOperator]) -> None:
         """Find which parts the pairs of the contacts couple. Collective."""
-        n = len(self.group)
+        n, self.sides = len(self.group), []
         self.touching = np.zeros((len(operators), self.n_bodies), dtype=np.bool_)
         every: list[Any] = [np.zeros((0, 2), dtype=np.intp)]
         for number, operator in enumerate(operators):
-            pairs = self.pairs(operator, number, self.label)
+            own, opposite = self._sides(operator, number, self.label)
+            self.sides.append((own, opposite[:, 0]))
+            pairs = self._pairs(own, opposite, number)
             self.touching[number, pairs[pairs < self.n_bodies]] = True
             every.append(pairs)
         links = np.concatenate(every)
@@ -241,23 +246,14 @@ class ReferenceScales:
             number: Of the contact.
             label: Part of each of these unknowns.
         """
-        own, opposite = self._sides(operator, number, label)
+        return self._pairs(*self._sides(operator, number, label), number)
+
+    def _pairs(self, own: Index, opposite: Index, number: int) -> Index:
+        """`pairs` of what `_sides` gave. Collective."""
         others = [*opposite.T, *(np.full_like(own, m) for m in self._motions[number])]
         n = len(self.group)
         mine = np.unique(np.concatenate([n * own + other for other in others]))
         return np.column_stack(divmod(np.unique(np.concatenate(self._comm.allgather(mine))), n))
-
-    def bodies_at_points(self, operator: ContactOperator, number: int) -> tuple[Index, Index]:
-        """The parts on both sides of this rank's points of a contact, (n_points,) each. Collective.
-
-        The second is the first where what lies opposite is rigid, or is nothing.
-
-        Args:
-            operator: Of the contact, over all unknowns.
-            number: Of the contact.
-        """
-        own, other = self._sides(operator, number, self.label)
-        return own, other[:, 0]
 
     def _sides(self, operator: ContactOperator, number: int, label: Index) -> tuple[Index, Index]:
         """The part on both sides of each of this rank's points. Collective.
