@@ -88,7 +88,7 @@ def _turning_stiffness(contact: Contact) -> Array:
     """Stiffness of friction that turns with the direction of slip, (n_points, gdim, gdim).
 
     Of slipping points in space, where it may be all that holds a body; in the plane it is none.
-    That of circular and elliptic friction cones; polygons have it by their corners, on average.
+    That of circular and elliptic friction cones, by which polygonal ones are approximated.
     """
     values, d = contact.values, contact.values.normal.shape[1]
     stiffness: Array = np.zeros((len(values.normal), d, d))

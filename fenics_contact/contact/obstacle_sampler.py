@@ -92,6 +92,10 @@ class ObstacleSampler:
         Returns:
             (n,) (length) and (n, gdim).
         """
+        if isinstance(self._obstacle, SampledObstacle):
+            with collective_errors(self._comm):
+                found = self._obstacle.sample_checked(place)
+            return found.distance, found.normal
         distance, normal, _ = self._sample(place, time)
         return distance, normal
 
@@ -101,18 +105,16 @@ class ObstacleSampler:
         Args:
             place: In the obstacle's frame, (n, gdim) (length).
         """
-        _, normal, gradient = self._sample(place, 1.0, gradient=True)
-        return np.asarray(np.linalg.norm(gradient + normal, axis=1))
-
-    def _sample(
-        self, place: Array, time: Array | float, *, gradient: bool = False
-    ) -> tuple[Array, Array, Array]:
-        """See `sample`; the gradient of the distance, too, if wanted or at no cost."""
         if isinstance(self._obstacle, SampledObstacle):
             with collective_errors(self._comm):
                 found = self._obstacle.sample_checked(place)
-                slope = _gradient(self._obstacle, place, found) if gradient else -found.normal
-            return found.distance, found.normal, slope
+                gradient, normal = _gradient(self._obstacle, place, found), found.normal
+        else:
+            _, normal, gradient = self._sample(place, 1.0)
+        return np.asarray(np.linalg.norm(gradient + normal, axis=1))
+
+    def _sample(self, place: Array, time: Array | float) -> tuple[Array, Array, Array]:
+        """See `sample`, of an obstacle given by UFL; the gradient of the distance, too."""
         n, d = place.shape
         if self._evaluate is None:
             self._evaluate = PointEvaluator(self._quadrature, self._expressions)
@@ -120,7 +122,7 @@ class ObstacleSampler:
         # The form has as many slots as Γc has points: the places go through it in batches.
         size = max(self._quadrature.n_points, 1)
         batches = max(self._comm.allgather(-(-n // size) if self._quadrature.n_points else 0))
-        distance, normal, slope = np.zeros(n), np.zeros((n, d)), np.zeros((n, d))
+        distance, normal, gradient = np.zeros(n), np.zeros((n, d)), np.zeros((n, d))
         for k in range(batches):
             some = slice(k * size, (k + 1) * size)
             for field, rows in ((self._place, place[some]), (self._time, time[some])):
@@ -128,8 +130,8 @@ class ObstacleSampler:
                 field.x.scatter_forward()
             values, m = self._evaluate(), len(place[some])
             distance[some], normal[some] = values["gap"][:m], values["normal"][:m]
-            slope[some] = values["gradient"][:m]
-        return distance, normal, slope
+            gradient[some] = values["gradient"][:m]
+        return distance, normal, gradient
 
 
 def _values(constants: Sequence[fem.Constant]) -> Array:

@@ -154,11 +154,6 @@ class ReferenceScales:
         self._comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
         return np.maximum(ends.sum(axis=0), 0.0)[: self.n_bodies]
 
-    def sums(self, values: Array) -> Array:
-        """Sum of absolute values of every body, at its unknowns, (n_bodies,). Collective."""
-        found = np.bincount(self.label, np.abs(values), minlength=len(self.group))
-        return global_sum(self._comm, found)[: self.n_bodies]
-
     def begin(self, operators: Sequence[ContactOperator]) -> None:
         """Find which parts are coupled. Collective.
 
@@ -185,7 +180,7 @@ class ReferenceScales:
         _, self.group = scipy.sparse.csgraph.connected_components(graph, directed=False)
 
     def is_unloaded(self, force: Array) -> Mask:
-        """Which bodies bear no force but round-off, by the sum of sizes of the forces on each."""
+        """Which bodies bear no force but round-off, by the norms of the forces on each."""
         return np.asarray(force <= ROUND_OFF * self.force)
 
     @property
