@@ -6,6 +6,8 @@ one without a load has an equilibrium wherever it is.
 
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 import pytest
 import ufl
@@ -535,3 +537,28 @@ def test_a_block_in_a_bowl_is_let_go_and_pressed_again():
         assert step.verdict.failures == []
         assert contact.resultants().normal_force >= 0.95 * load
         assert contact.resultants().force[1] == pytest.approx(load, abs=1e-9)
+
+
+@pytest.mark.each
+@pytest.mark.parametrize("modulus", [1e3, 1e9])
+@pytest.mark.parametrize("n", [2, 4])
+def test_no_body_diverges_to_where_round_off_hides_forces(n, modulus):
+    """A floor moves off a block without load that Tresca friction grips where it is open, too.
+
+    Nothing holds the block along the normal: displaced by 1e10 of its size it was verified with a
+    force of 0.1 on it. Reference: zero, the load; or the increment fails. To 1e-8 of the pressure.
+    """
+    scene = Beside({"block": Box(size=(1.0, 0.5), n=(2 * n, n))}, E=modulus)
+    pressure, shift = 1e-3 * modulus, scene.bodies.constant((0.0, 0.0))
+    load = scene.bodies.constant(-pressure)
+    scene.load("block", TOP, 1, load)
+    floor, law = fc.HalfSpace((0, 0), (0, 1), shift), fc.Tresca(0.3, 0.1 * pressure)
+    contact = scene.contact("block", BOTTOM, floor, law)
+    problem = scene.problem(contact)
+    for load.value in (-pressure, 0.0):
+        problem.solve()
+        problem.commit()
+    shift.value[:] = 0.01, -0.01
+    with contextlib.suppress(fc.NotConverged):
+        problem.solve()
+        assert np.abs(contact.resultants().force).max() < 1e-8 * pressure

@@ -27,6 +27,9 @@ _SMALL = 1e-200
 # Round-off of a product K u by the size of its terms, summed up row by row. A body that is carried
 # along shows it: up to 14 eps on random tetrahedra of degree 2, 34 on a distorted mesh.
 _ROUND_OFF = 40 * np.finfo(float).eps
+# How far a body that no condition holds may be displaced, by its size, for round-off to excuse all
+# that it leaves: 1e-11 of its stiffness. What diverges along a free motion excuses no more.
+_FARTHEST = 1e3
 # The largest share of forces that round-off excuses: of loads, of contact forces on a body that no
 # condition holds, and on one of both sides of every contact.
 MOST_EXCUSED = 1e-5
@@ -176,14 +179,17 @@ class Parts:
             contact[body] = _root(pushes[number])
         force = np.max([loads, reaction, contact], axis=0)
         round_off = np.maximum(_ROUND_OFF * np.maximum(terms, start.terms), _LEAST)
+        # A displacement that nothing holds may grow without bounds, and would excuse anything.
+        fixed = self._scales.held
+        stiffness = np.append(self._scales.force, np.full(len(self._motions), np.inf))
+        most_excused = _ROUND_OFF * _FARTHEST * stiffness
+        round_off = np.where(fixed, round_off, np.minimum(round_off, most_excused))
         # A contact force is as exact as the softer of both bodies has it.
         exact = np.tile(round_off, (len(contacts), 1))
         for row, pairs in zip(exact, self._pairs, strict=True):
             for one, other in (pairs.T, pairs.T[::-1]):
                 np.minimum.at(row, one, round_off[other])
         acts = pushes > np.maximum(exact, ROUND_OFF * force)
-        # A displacement that nothing holds may grow without bounds, and would excuse anything.
-        fixed = self._scales.held
         # What a sine leaves of a load at its zeros, and moves no digit where conditions hold all.
         none = np.append(_ROUND_OFF * self._scales.least_force, np.zeros(len(self._motions)))
         loaded = loads > np.where(fixed, none, 0.0)
