@@ -27,8 +27,9 @@ _SMALL = 1e-200
 # Round-off of a product K u by the size of its terms, summed up row by row. A body that is carried
 # along shows it: up to 14 eps on random tetrahedra of degree 2, 34 on a distorted mesh.
 _ROUND_OFF = 40 * np.finfo(float).eps
-# How far a body that no condition holds may be displaced, by its size, for round-off to excuse all
-# that it leaves: 1e-11 of its stiffness. What diverges along a free motion excuses no more.
+# How far a body that no condition holds may be displaced, by its size or by how far it is as the
+# increment starts, for round-off to excuse all that it leaves: 1e-11 of its stiffness. What
+# diverges along a free motion excuses no more.
 _FARTHEST = 1e3
 # The largest share of forces that round-off excuses: of loads, of contact forces on a body that no
 # condition holds, and on one of both sides of every contact.
@@ -182,7 +183,7 @@ class Parts:
         # A displacement that nothing holds may grow without bounds, and would excuse anything.
         fixed = self._scales.held
         stiffness = np.append(self._scales.force, np.full(len(self._motions), np.inf))
-        most_excused = _ROUND_OFF * _FARTHEST * stiffness
+        most_excused = _ROUND_OFF * _FARTHEST * np.maximum(stiffness, start.terms)
         round_off = np.where(fixed, round_off, np.minimum(round_off, most_excused))
         # A contact force is as exact as the softer of both bodies has it.
         exact = np.tile(round_off, (len(contacts), 1))
