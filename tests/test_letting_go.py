@@ -543,10 +543,11 @@ def test_a_block_in_a_bowl_is_let_go_and_pressed_again():
 @pytest.mark.parametrize("modulus", [1e3, 1e9])
 @pytest.mark.parametrize("n", [2, 4])
 def test_no_body_diverges_to_where_round_off_hides_forces(n, modulus):
-    """A floor moves off a block without load that Tresca friction grips where it is open, too.
+    """A floor moves off a block without load; Tresca friction acts at its open points, too.
 
     Nothing holds the block along the normal: displaced by 1e10 of its size it was verified with a
-    force of 0.1 on it. Reference: zero, the load; or the increment fails. To 1e-8 of the pressure.
+    force of 0.1 on it. References: no balance at such a state, by the forces there, which are at
+    the friction bound; and zero, the load, to 1e-8 of the pressure, unless the increment fails.
     """
     scene = Beside({"block": Box(size=(1.0, 0.5), n=(2 * n, n))}, E=modulus)
     pressure, shift = 1e-3 * modulus, scene.bodies.constant((0.0, 0.0))
@@ -559,6 +560,10 @@ def test_no_body_diverges_to_where_round_off_hides_forces(n, modulus):
         problem.solve()
         problem.commit()
     shift.value[:] = 0.01, -0.01
+    away, equations = problem.full.state(), problem.solver.equations
+    away += 1e10 * problem.motions.of_bodies[0, 1]
     with contextlib.suppress(fc.NotConverged):
         problem.solve()
         assert np.abs(contact.resultants().force).max() < 1e-8 * pressure
+    assert np.isfinite(equations.residual_at(equations.system.part(away)))
+    assert not equations.norms.within(1e-9)

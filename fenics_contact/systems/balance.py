@@ -179,12 +179,13 @@ class Parts:
             # What acts on a free obstacle may cancel; what it is the sum of does not.
             contact[body] = _root(pushes[number])
         force = np.max([loads, reaction, contact], axis=0)
-        round_off = np.maximum(_ROUND_OFF * np.maximum(terms, start.terms), _LEAST)
         # A displacement that nothing holds may grow without bounds, and would excuse anything.
         fixed = self._scales.held
-        stiffness = np.append(self._scales.force, np.full(len(self._motions), np.inf))
-        most_excused = _ROUND_OFF * _FARTHEST * np.maximum(stiffness, start.terms)
-        round_off = np.where(fixed, round_off, np.minimum(round_off, most_excused))
+        of_bodies = np.append(self._scales.force, np.full(len(self._motions), np.inf))
+        farthest = _FARTHEST * np.maximum(of_bodies, start.terms)
+        terms = np.maximum(terms, start.terms)
+        terms = np.where(fixed, terms, np.minimum(terms, farthest))
+        round_off = np.maximum(_ROUND_OFF * terms, _LEAST)
         # A contact force is as exact as the softer of both bodies has it.
         exact = np.tile(round_off, (len(contacts), 1))
         for row, pairs in zip(exact, self._pairs, strict=True):
