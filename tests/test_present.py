@@ -578,9 +578,9 @@ def test_condensed_as_on_all_unknowns(cell, degree):
 
     One factorisation serves a block that is pressed, and dragged over facets of the other.
     """
-    found = []
+    found, pair = [], None
     for condensation in (True, False):
-        pair = Pair(cell, fc.Coulomb(0.3), degree=degree, kinematics="finite")
+        pair = Pair(cell, fc.Coulomb(0.3), degree=degree, like=pair, kinematics="finite")
         mesh, tags, last = pair.mesh, pair.tags, pair.d - 1
         side, down = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
         bcs = [hold(pair.u, tags, BOTTOM, i) for i in range(pair.d)]
