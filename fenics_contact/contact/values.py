@@ -237,6 +237,11 @@ class PointValues:
         borne, trial = (np.linalg.norm(v, axis=1) for v in (self.traction, stuck))
         return np.where(trial > 0, borne / np.where(trial > 0, trial, 1.0), 1.0)
 
+    @property
+    def slips(self) -> Mask:
+        """Which points slip against friction, open ones too if it acts there, (n_points,)."""
+        return np.asarray(np.any(self.slip_increment != 0, axis=1))
+
     def springs(self, normal: npt.ArrayLike, tangential: npt.ArrayLike) -> Array:
         """Return the symmetric stiffness a K_n + b K_t of the quasi-Newton method at the points.
 
@@ -288,5 +293,5 @@ class PointValues:
         closed = (self.paired > 0) & ((self.normal_traction < 0) | tension)
         status = np.where(closed, Status.SLIP, Status.OPEN).astype(np.int8)
         if sticks:
-            status[closed & np.all(self.slip_increment == 0, axis=1)] = Status.STICK
+            status[closed & ~self.slips] = Status.STICK
         return status

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-import scipy.optimize
 
 from fenics_contact.contact.opposite import ObstacleMotion
 from fenics_contact.contact.values import Status
+from fenics_contact.methods.linear_programmes import least_sum, linear_programme
 from fenics_contact.parallel import agreed, gather_rows, global_max, global_min, global_sum
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes, tangential_gram
@@ -335,7 +335,8 @@ class Approach:
         for contact, jumps in zip(self._full.contacts, free.jumps, strict=True):
             values, weights = contact.values, contact.quadrature.weights
             closing = np.einsum("mqd,qd->qm", jumps, values.normal)
-            grams += [tangential_gram(contact, jumps, weights), (closing.T * weights) @ closing]
+            rubs = tangential_gram(contact, jumps, closed_only=False)
+            grams += [rubs, (closing.T * weights) @ closing]
             there = contact.paired & _feeling(jumps)
             rows.append(np.column_stack([closing, values.gap])[there])
         rubs, presses = global_sum(comm, grams)
@@ -369,47 +370,15 @@ class Approach:
         # What was let go, obstacles may have moved into: it goes out, or no deeper where it cannot.
         for deep in (gaps, np.maximum(gaps, NEGLIGIBLE)):
             limit = np.concatenate([deep, ends])
-            found = _linear_programme(-work, matrix, limit)
+            found = linear_programme(-work, matrix, limit)
             if found is not None or gaps.min() >= 0:
                 break
         if found is None:
             return None
-        return far * (ways @ agreed(comm, _least_motion(work, matrix, limit, found)))
-
-
-def _linear_programme(cost: Array, matrix: Array, limit: Array) -> Array | None:
-    """Minimise cost @ x where matrix @ x <= limit; None: there is no such x, or no least cost."""
-    found = scipy.optimize.linprog(
-        cost,
-        A_ub=matrix,
-        b_ub=limit,
-        bounds=(None, None),
-        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
-    )
-    return found.x if found.status == 0 else None
-
-
-def _least_motion(work: Array, matrix: Array, limit: Array, found: Array) -> Array:
-    """Of all solutions with the work of one that was found the one of least coefficients.
-
-    A body without load, which others may push, is free to go anywhere that gaps permit: it stays.
-
-    Args:
-        work: Of the load on the coefficients, (n,).
-        matrix: As in `_linear_programme`.
-        limit: Likewise.
-        found: The solution, (n,).
-    """
-    n, unit = len(work), np.eye(len(work))
-    most = work @ found
-    rows = [
-        np.hstack([matrix, np.zeros_like(matrix)]),
-        np.hstack([unit, -unit]),
-        np.hstack([-unit, -unit]),
-        np.concatenate([-work, np.zeros(n)])[None],
-    ]
-    # It gives back no more than a tenth of what bodies are set down deeper than to touch.
-    ends = np.concatenate([limit, np.zeros(2 * n), [-most + 0.1 * NEGLIGIBLE * abs(most)]])
-    cost = np.concatenate([np.zeros(n), np.ones(n)])
-    least = _linear_programme(cost, np.concatenate(rows), ends)
-    return found if least is None else least[:n]
+        # A body without load, which others may push, is free to go anywhere that gaps permit: it
+        # stays. It gives back no more than a tenth of what bodies are set down deeper than to
+        # touch.
+        least_work = (1.0 - 0.1 * NEGLIGIBLE) * float(work @ found)
+        matrix, limit = np.vstack([matrix, -work]), np.append(limit, [-least_work])
+        least = least_sum(matrix, limit, np.eye(len(work)), np.zeros(len(work)))
+        return far * (ways @ agreed(comm, found if least is None else least))

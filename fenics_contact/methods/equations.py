@@ -24,7 +24,7 @@ from fenics_contact.systems.hierarchy import Hierarchy
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.system import System
 from fenics_contact.tolerances import ROUND_OFF
-from fenics_contact.types import Array, Mask
+from fenics_contact.types import Array
 
 __all__ = ["Equations"]
 
@@ -60,8 +60,8 @@ class Equations:
         hierarchy: Its levels.
         factorisations: Of sparse matrices, counted.
         loads: The largest generalised force of the load on rigid-body modes, (n_groups,) (force).
-        free_parts: Bodies and free obstacles of groups with a rigid-body mode along which the
-            consistent tangent assembled last is regularised, (n_parts,).
+        regularised_modes: Rigid-body modes along which the consistent tangent assembled last is
+            regularised, in free motions, (n_modes, n_free).
         overload: By what the load outdid friction where `friction_needed` looked last, if it did.
     """
 
@@ -89,7 +89,7 @@ class Equations:
         self.by_cycle, self.hierarchy = False, Hierarchy()
         self.factorisations = 0
         self.loads: Array = np.zeros(full.scales.n_groups)
-        self.free_parts: Mask = np.zeros(len(full.scales.group), np.bool_)
+        self.regularised_modes: Array = np.zeros((0, 0))
         self.overload: Overload | None = None
         self._matrices: dict[bool, PETSc.Mat] = {}
         self._filled: set[bool] = set()
@@ -233,7 +233,7 @@ class Equations:
         """
         filled = {c for c, m in self._matrices.items() if m.handle == matrix.handle}
         if True in filled:  # unless ``contacts``, made while the matrix is filled, are regularised
-            self.free_parts = np.zeros_like(self.free_parts)
+            self.regularised_modes = np.zeros((0, len(self.motions.free)))
         self.factorisations += self.system.fill(matrix, contacts)
         self.has_round_off = True
         if self.system.pattern_changes:
@@ -286,29 +286,33 @@ class Equations:
         present pressure, with which a step along the mode goes as far as they have slipped, by the
         share of the forces on the mode that is not in balance. Open points get the stiffness with
         which it closes the nearest gap (`LooseModes.closing`), where slipping points would not hold
-        the body if they stuck. With what is not in balance the regularisation vanishes, and
-        convergence stays superlinear (Levenberg-Marquardt).
+        the body if they stuck; those at which friction acts all the same, as one whose bound does
+        not depend on pressure does, count as slipping points along Γc. With what is not in balance
+        the regularisation vanishes, and convergence stays superlinear (Levenberg-Marquardt).
         """
         full, modes = self.full, self._loose_modes()
         if modes is None or np.isnan(modes.share).all():
-            self.free_parts = np.zeros(len(full.scales.group), np.bool_)
+            self.regularised_modes = np.zeros((0, len(self.motions.free)))
             yield from self.tangents()
             return
         free = ~np.isnan(modes.share)
-        self.free_parts = free[full.scales.group]
+        self.regularised_modes = modes.ways
         share = np.where(free, np.maximum(modes.share, _LEAST_SHARE), 0.0)
         operators = self.system.operators
         within = [operator.within for operator in operators]
         closing = modes.closing(self.motions, full.scales, full.operators, within)
         for number, (operator, close) in enumerate(zip(operators, closing, strict=True)):
             contact, group = operator.contact, full.scales.group_of_points(number)
-            slips = np.where(contact.status == Status.SLIP, share[group], 0.0)
+            values, closed = contact.values, contact.status != Status.OPEN
+            slips = np.where(values.slips, share[group], 0.0)
             opens = np.where(close < 1.0, close, share[group])
-            opens[(contact.status != Status.OPEN) | ~modes.is_open[group]] = 0.0
+            opens[closed | ~modes.is_open[group]] = 0.0
             tangent = contact.acting.tangent().scaled(1.0 - slips)
             yield operator.tangent(tangent)
-            secant = slips * contact.values.friction_secant
-            yield operator.springs(contact.values.springs(opens + slips, opens + secant))
+            normal = opens + np.where(closed, slips, 0.0)
+            tangential = np.where(values.friction_bound > 0, 0.0, opens)
+            tangential += slips * values.friction_secant
+            yield operator.springs(values.springs(normal, tangential))
 
     def _loose_modes(self) -> LooseModes | None:
         """Rigid-body modes that contact leaves free at the evaluated state. Collective."""

@@ -280,7 +280,7 @@ class _Springs:
         normal = values.normal_stiffness * values.gap - values.multiplier
         stuck = values.old_traction - _times(values.tangential_stiffness, values.increment)
         lifted = np.where(values.normal_traction < 0, 0.0, normal)
-        sticks = (values.friction_bound > 0) & np.all(values.slip_increment == 0, axis=1)
+        sticks = (values.friction_bound > 0) & ~values.slips
         slid = np.where(sticks[:, None], 0.0, values.tangential(stuck - values.traction))
         n = values.normal
         return normal[:, None] * n + stuck, lifted[:, None] * n + slid

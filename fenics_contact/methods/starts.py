@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from fenics_contact.contact.point_law import PointTangent
 from fenics_contact.contact.values import PointValues
 from fenics_contact.methods.equations import Equations
-from fenics_contact.parallel import global_max
+from fenics_contact.parallel import agreed, global_max, global_sum
 from fenics_contact.systems import dense, linear
 from fenics_contact.systems.system import System
 from fenics_contact.tolerances import FLAT, NEGLIGIBLE
@@ -231,7 +231,7 @@ class Starts:
         found = ksp.getConvergedReason() > 0
         linear.forget_failure(ksp.getPC())
         if not anew:
-            self._stay_where_free(full, step)
+            self._without_regularised_modes(full, step)
         full.set_state(present)
         full.update_stiffness()
         return present + step.array_r if found else present
@@ -266,7 +266,7 @@ class Starts:
         dense.raise_kept(ksp)
         found = ksp.getConvergedReason() > 0
         linear.forget_failure(ksp.getPC())
-        self._stay_where_free(system, step)
+        self._without_regularised_modes(system, step)
         moved: Array | None = present - step.array_r if found else None
         for vector in (forces, step):
             vector.destroy()
@@ -297,10 +297,20 @@ class Starts:
             tractions.append(traction)
         return tractions if moved else None
 
-    def _stay_where_free(self, system: System, step: PETSc.Vec) -> None:
-        """Take bodies out of a step of which contact left a mode free where the last one ended.
+    def _without_regularised_modes(self, system: System, step: PETSc.Vec) -> None:
+        """Take the modes along which the tangent was regularised out of a step on it. Collective.
 
         At a solution next to nothing is left of what regularises the tangent along such a mode: a
-        step by it may go any distance.
+        step by it may go any distance. All else of the step is right.
         """
-        step.array[self._equations.free_parts[system.label]] = 0.0
+        equations = self._equations
+        ways, motions = equations.regularised_modes, equations.motions
+        if not len(ways):
+            return
+        fields = motions.fields if equations.full.bulk.linear else motions.present_fields()
+        modes = np.array([system.part(way) for way in ways @ fields])
+        modes[:, system.constrained] = 0.0
+        sums = np.column_stack([modes @ modes.T, modes @ step.array_r])
+        sums = global_sum(equations.full.unknowns.comm, sums)
+        share = np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=NEGLIGIBLE)[0]
+        step.array[:] -= agreed(equations.full.unknowns.comm, share) @ modes

@@ -23,7 +23,7 @@ from fenics_contact.parallel import global_sum
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_cells
 from fenics_contact.systems.operator import ContactOperator
-from fenics_contact.tolerances import ROUND_OFF
+from fenics_contact.tolerances import NEGLIGIBLE, ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["ReferenceScales", "body_of_points"]
@@ -189,6 +189,19 @@ class ReferenceScales:
         found = np.full(self.n_groups, np.inf)
         np.minimum.at(found, self.group[: self.n_bodies], ROUND_OFF * self.force)
         return np.where(np.isfinite(found), found, 0.0)
+
+    def round_off_at_points(self, number: int, forces: Array) -> Array:
+        """Force at points of a contact that is round-off, by their group, (n_points,). Collective.
+
+        Args:
+            number: Of the contact.
+            forces: Sizes of forces there, (..., n_points) (force).
+        """
+        group, largest = self.group_of_points(number), np.zeros(self.n_groups)
+        sizes = np.where(np.isfinite(forces), forces, 0.0).reshape(-1, len(group))
+        np.maximum.at(largest, group, sizes.max(axis=0, initial=0.0))
+        self._comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+        return np.asarray(np.maximum(self.round_off_of_groups, NEGLIGIBLE * largest)[group])
 
     @property
     def size_of_groups(self) -> Array:

@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.contact.contact import Contact
-from fenics_contact.contact.values import Status
+from fenics_contact.contact.values import PointValues, Status
 from fenics_contact.parallel import agreed, global_sum
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.displacement import Displacement
@@ -265,7 +265,10 @@ class RigidBodyModes:
         return " with ".join(terms)
 
     def is_constrained(self, operators: Sequence[ContactOperator]) -> bool:
-        """Whether the points that are closed now hold every free motion. Collective.
+        """Whether the points at which contact acts now hold every free motion. Collective.
+
+        Those that are closed, and along Γc those with a friction bound: one that does not depend on
+        pressure is one of open points, too.
 
         Args:
             operators: Of evaluated contacts, over all unknowns.
@@ -274,10 +277,9 @@ class RigidBodyModes:
             return True
         bearing = []
         for contact in (operator.contact for operator in operators):
-            closed = contact.status != Status.OPEN
-            bearing.append(closed)
+            bearing.append(contact.status != Status.OPEN)
             if contact.law.has_tangential:
-                bearing.append(closed & (contact.values.friction_bound_ratio > 0))
+                bearing.append(_resists_tangentially(contact, closed_only=True))
         # What holds a body still does with more of Γc closed: no need to look again.
         same = bool(self._holding) and all(operator in self._holders for operator in operators)
         same = same and not self._turning.any()
@@ -306,7 +308,8 @@ class RigidBodyModes:
         Args:
             operators: Of evaluated contacts, over all unknowns.
             rows: Numbers of the free motions to look at.
-            closed_only: Whether the points that are closed now alone feel any.
+            closed_only: Whether the points at which contact acts now alone feel any, see
+                `is_constrained`.
             slips: Whether those that slip feel no motion along their friction.
         """
         n_free = len(rows)
@@ -325,17 +328,78 @@ class RigidBodyModes:
             if contact.law.has_normal_stiffness:
                 gram += (along * weights) @ along.T
             if slips:
-                way = _slip(contact)
+                way = _slip(contact, values)
                 modes = modes - np.einsum("mqd,qd->mq", modes, way)[:, :, None] * way
-            gram += tangential_gram(contact, modes, weights)
+            gram += tangential_gram(contact, modes, closed_only=closed_only)
         gram, area = global_sum(self.comm, gram), global_sum(self.comm, area)
+        return self._null_space(gram, area, rows)
+
+    def unloaded(
+        self,
+        operators: Sequence[ContactOperator],
+        states: Sequence[Sequence[PointValues | None]],
+    ) -> Array:
+        """Along which free motions no force of contact acts, (n_unloaded, n_free). Collective.
+
+        None but round-off, in any of some states. Friction acts in all directions along Γc as far
+        as its bound goes.
+
+        Args:
+            operators: Of the contacts, over all unknowns.
+            states: Values at the points of every contact in each; None: it bore nothing.
+        """
+        n = len(self.free)
+        gram: Array = np.zeros((n, n))
+        area: Array = np.zeros(n)
+        for number, operator in enumerate(operators):
+            contact = operator.contact
+            modes, weights = self.at_points(operator), contact.quadrature.weights
+            felt = np.abs(modes).max(axis=2, initial=0.0) > NEGLIGIBLE
+            area += felt @ weights
+            for values in (state[number] for state in states):
+                if values is None:
+                    continue
+                acts = self.acting(number, contact, values)
+                normal = np.where(np.isfinite(values.normal), values.normal, 0.0)
+                along = np.einsum("mqd,qd->mq", modes, normal)
+                across = modes - along[:, :, None] * normal
+                gram += (along * (weights * acts[0])) @ along.T
+                gram += np.einsum("mqd,q,nqd->mn", across, weights * acts[1], across)
+        gram, area = global_sum(self.comm, gram), global_sum(self.comm, area)
+        return self._null_space(gram, area, np.arange(n))
+
+    def acting(self, number: int, contact: Contact, values: PointValues) -> Mask:
+        """Whether forces act at points, but for round-off: normal ones and friction, (2, n_points).
+
+        That of friction is as large as its bound. Collective.
+
+        Args:
+            number: Of the contact.
+            contact: The contact.
+            values: At its points.
+        """
+        friction = np.maximum(np.linalg.norm(values.traction, axis=1), values.friction_bound)
+        forces = contact.measure * np.array([np.abs(values.normal_traction), friction])
+        forces[np.isnan(forces)] = 0.0
+        return np.asarray(forces > self._scales.round_off_at_points(number, forces))
+
+    def _null_space(self, gram: Array, area: Array, rows: Index) -> Array:
+        """Combinations of free motions that a sum over points does not feel, (n_found, n_rows).
+
+        Collective.
+
+        Args:
+            gram: Products of the motions by what is felt, weighted by area, (n_rows, n_rows).
+            area: Of the points that feel each, (n_rows,).
+            rows: Their numbers among the free motions.
+        """
         scale = 1 / np.sqrt(np.where(area > 0, area, 1.0))
-        gram *= np.outer(scale, scale)
-        loose, groups = [np.zeros((0, n_free))], self.groups()[rows]
+        gram = gram * np.outer(scale, scale)
+        loose, groups = [np.zeros((0, len(rows)))], self.groups()[rows]
         for group in np.unique(groups):  # no vector is of several
             mine = np.flatnonzero(groups == group)
             sizes, vectors = np.linalg.eigh(gram[np.ix_(mine, mine)])
-            found = np.zeros((np.count_nonzero(sizes < NEGLIGIBLE), n_free))
+            found = np.zeros((np.count_nonzero(sizes < NEGLIGIBLE), len(rows)))
             found[:, mine] = (vectors * scale[mine, None])[:, sizes < NEGLIGIBLE].T
             loose.append(found)
         return agreed(self.comm, np.concatenate(loose))
@@ -416,22 +480,44 @@ def _plain(rows: Array) -> Array:
     return rows / np.abs(rows).max(axis=1, initial=1.0)[:, None] if rows.size else rows
 
 
-def _slip(contact: Contact) -> Array:
+def _slip(contact: Contact, values: PointValues) -> Array:
     """Along the friction of the points that slip against it, of length 1 or 0, (n_points, gdim).
 
     The traction there is constant along it, but where the friction bound depends on the motion.
     """
-    traction = contact.values.traction
-    size = np.linalg.norm(traction, axis=1)
-    slips = (contact.status == Status.SLIP) & (size > 0) & contact.law.has_friction
+    size = np.linalg.norm(values.traction, axis=1)
+    slips = values.slips & (size > 0) & contact.law.has_friction
     slips &= not contact.acting.own.bound_depends_on_motion
-    return np.asarray(traction * (slips / np.where(slips, size, 1.0))[:, None], dtype=np.float64)
+    way = values.traction * (slips / np.where(slips, size, 1.0))[:, None]
+    return np.asarray(way, dtype=np.float64)
 
 
-def tangential_gram(contact: Contact, modes: Array, weights: Array) -> Array:
-    """Products along Γc, where it resists, of n motions by their jumps, (n, n_points, gdim)."""
+def _resists_tangentially(contact: Contact, *, closed_only: bool) -> Mask:
+    """Where Γc resists motion along it, (n_points,).
+
+    Args:
+        contact: Evaluated.
+        closed_only: Whether that is where it acts now: closed, or with a friction bound all the
+            same; or where it would if all of it were closed.
+    """
+    values = contact.values
+    resists = values.friction_bound_ratio > 0
+    if closed_only:
+        resists = resists & ((contact.status != Status.OPEN) | (values.friction_bound > 0))
+    return np.asarray(resists)
+
+
+def tangential_gram(contact: Contact, modes: Array, *, closed_only: bool) -> Array:
+    """Products along Γc, where it resists, of n motions by their jumps, (n, n_points, gdim).
+
+    Args:
+        contact: Evaluated.
+        modes: The jumps.
+        closed_only: As in `RigidBodyModes.unconstrained`.
+    """
     if not contact.law.has_tangential:
         return np.zeros((len(modes), len(modes)))
-    normal, resists = contact.values.normal, weights * (contact.values.friction_bound_ratio > 0)
+    normal = contact.values.normal
+    weights = contact.quadrature.weights * _resists_tangentially(contact, closed_only=closed_only)
     across = modes - np.einsum("mqd,qd->mq", modes, normal)[:, :, None] * normal
-    return np.asarray(np.einsum("mqd,q,nqd->mn", across, resists, across), dtype=np.float64)
+    return np.asarray(np.einsum("mqd,q,nqd->mn", across, weights, across), dtype=np.float64)
