@@ -18,6 +18,7 @@ from fenics_contact.failure import NotConverged
 from fenics_contact.methods.approach import Approach
 from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.first_touch import FirstTouch
+from fenics_contact.methods.least_motion import move_least
 from fenics_contact.methods.load_balance import LoadBalance
 from fenics_contact.methods.opposite_points import OppositePoints
 from fenics_contact.methods.solver import Solver
@@ -181,6 +182,8 @@ class IncrementSolver:
             solver.system.complete(solver.system.pending_field)
         for contact in self._contacts:
             contact.evaluate()
+        if reason > 0:
+            move_least(solver.equations)
         increment.tried += attempts
         if reason <= 0 and points.drop_prediction():
             return increment.ends(Again.FROM_COMMITTED)

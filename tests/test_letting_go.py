@@ -570,3 +570,54 @@ def test_friction_without_pressure_takes_a_block_along(n, modulus, kinematics, r
         away = before + 1e10 * problem.motions.of_bodies[0, 1]
         assert np.isfinite(equations.residual_at(equations.system.part(away)))
         assert not equations.norms.within(1e-9)
+
+
+@pytest.mark.each
+@pytest.mark.parametrize("n_steps", [4, 8])
+@pytest.mark.parametrize(
+    ("kinematics", "rubber"), [("small", False), ("finite", False), ("finite", True)]
+)
+def test_a_block_without_load_stays_where_it_was_pushed(kinematics, rubber, n_steps):
+    """By another one, led 0.85 over a gap of 0.2 and back by 0.7; a ball then comes down on it.
+
+    References: 0.65; the force on the ball where the block is meshed there, to 1e-6. With small
+    displacements the ball would be another obstacle there.
+    """
+
+    def scene(place):
+        pushed = Box((place, 0.0), n=(4, 4))
+        led = Box((-1.2, 0.1), (1.0, 0.8), n=(4, 4))
+        scene = Beside({"pushed": pushed, "led": led}, E=1e3, rubber=rubber)
+        along, down = scene.bodies.constant(0.0), scene.bodies.constant((0.0, 0.0))
+        scene.hold("led", LEFT, 0, value=along)
+        scene.hold("led", LEFT, 1)
+        floor, ball = fc.HalfSpace((0, 0), (0, 1)), fc.Ball((1.15, 3.1), 2.0, displacement=down)
+        options = {"law": fc.Coulomb(0.3), "kinematics": kinematics}
+        contacts = [
+            scene.contact("pushed", BOTTOM, floor, name="floor", **options),
+            scene.contact("pushed", LEFT, ("led", RIGHT), name="side", **options),
+        ]
+        if kinematics == "finite":
+            contacts.append(scene.contact("pushed", TOP, ball, name="ball", **options))
+        return scene.problem(*contacts), along, down
+
+    problem, along, down = scene(0.0)
+    for start, end in ((0.0, 0.85), (0.85, 0.15)):
+        for along.value in start + (end - start) * np.arange(1, n_steps + 1) / n_steps:
+            problem.solve()
+            problem.commit()
+        ways = gathered(COMM, problem.contacts[0].own_displacement())
+        assert np.abs(ways - (0.65, 0.0)).max() < 1e-7
+    if kinematics == "small":
+        return
+    forces = []
+    there, _, down_there = scene(0.65)
+    there.solve()
+    there.commit()
+    for each, way in ((problem, down), (there, down_there)):
+        for way.value[1] in np.linspace(-0.012, -0.12, 10):
+            each.solve()
+            each.commit()
+        forces.append(each.contacts[-1].resultants().force[1])
+    assert forces[0] == pytest.approx(forces[1], rel=1e-6)
+    assert abs(forces[1]) > 1.0
