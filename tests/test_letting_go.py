@@ -386,15 +386,17 @@ def test_a_stack_springs_back(n_steps, bulk, kinematics):
     assert np.abs(gathered(COMM, owned(bodies.u))).max() < 1e-6
 
 
+@pytest.mark.parametrize("slope", [0.1, 0.02])
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_a_wedge_that_jaws_push_out_is_not_thrown_out(kinematics):
-    """Without a load, of slope 0.1, between rigid jaws that close by 0.01 each, in one increment.
+def test_a_wedge_that_jaws_push_out_is_not_thrown_out(kinematics, slope):
+    """Without a load, between rigid jaws that close by 0.1 of the slope each, in one increment.
 
-    Reference: geometry, 0.01 / 0.1 = 0.1 up, to 1e-4, ten times what anything else moves by.
+    Reference: geometry, 0.1 up, to 1e-4, ten and fifty times what anything else moves by.
     """
     lines = [[np.linspace(-0.3, 0.3, 4), np.linspace(0.0, 1.0, 5)]]
     faces = {LEFT: near(0, -0.3), RIGHT: near(0, 0.3)}
-    mesh, tags = boxes(lines, faces, bend=lambda x: x * (1 + (x[:, 1:] - 0.5) * [1 / 3, 0]))
+    bend = np.array([slope / 0.3, 0.0])
+    mesh, tags = boxes(lines, faces, bend=lambda x: x * (1 + (x[:, 1:] - 0.5) * bend))
     wedge = Bodies((mesh, tags), 1e3, 0.3)
     shifts = [wedge.constant((0.0, 0.0)) for _ in range(2)]
     jaws = zip((LEFT, RIGHT), (1, -1), shifts, strict=True)
@@ -402,8 +404,8 @@ def test_a_wedge_that_jaws_push_out_is_not_thrown_out(kinematics):
         *(
             wedge.contact(
                 tag,
-                fc.HalfSpace((-0.3 * side, 0.5), (side, 0.1), displacement=shift),
-                fc.Coulomb(0.02),
+                fc.HalfSpace((-0.3 * side, 0.5), (side, slope), displacement=shift),
+                fc.Coulomb(0.2 * slope),
                 name=f"jaw {tag}",
                 kinematics=kinematics,
             )
@@ -413,7 +415,7 @@ def test_a_wedge_that_jaws_push_out_is_not_thrown_out(kinematics):
     )
     problem.solve()
     problem.commit()
-    shifts[0].value[0], shifts[1].value[0] = 0.01, -0.01
+    shifts[0].value[0], shifts[1].value[0] = 0.1 * slope, -0.1 * slope
     problem.solve()
     place = gathered(COMM, problem.contacts[0].own_displacement())
     assert np.abs(place[:, 1] - 0.1).max() < 1e-4
@@ -424,7 +426,7 @@ def test_a_body_that_a_floor_has_thrown_is_told_of(way):
     """One that is farther away than three times what the floor has moved by.
 
     References: the displacements given: the block by `way` along the floor, which moves by 1, and
-    by 0.5 off it, where the floor may push it.
+    by 0.5 off it.
     """
     scene = Free("quadrilateral", "linear", kinematics="finite")
     problem, u = scene.problem, scene.u
@@ -435,8 +437,34 @@ def test_a_body_that_a_floor_has_thrown_is_told_of(way):
     forces, start = problem.full.contact_forces(), problem.solver.equations.start
     found = find_ejected_bodies(problem.full, problem.motions, forces, before, start)
     assert len(found) == (way > 3.0)
-    expected = way, 3.0, 1.0
+    expected = np.hypot(way, 0.5), 3.0, 1.0
     assert all(close(np.array(ways), expected, 1e-12) for ways in found.values())
+
+
+def test_a_body_that_a_ball_has_thrown_off_a_wall_is_told_of():
+    """From the floor and a wall at rest, by 1, as a ball moves 0.02 into it; no force acts on it.
+
+    Nothing but a force holds it where it was: no motion gets it out from between ball and floor.
+    References: the displacements given. The wall's normals took all that is along them for pushed.
+    """
+    scene = Beside({"block": Box(n=(4, 4))}, E=1e3)
+    down = scene.bodies.constant((0.0, 0.0))
+    sides = {
+        BOTTOM: fc.HalfSpace((0, 0), (0, 1)),
+        LEFT: fc.HalfSpace((0, 0), (1, 0)),
+        TOP: fc.Ball((0.5, 3.0), 2.0, displacement=down),
+    }
+    options = {"law": fc.Coulomb(0.3), "kinematics": "finite"}
+    contacts = [scene.contact("block", s, o, name=f"{s}", **options) for s, o in sides.items()]
+    problem, u = scene.problem(*contacts), scene.bodies.u
+    down.value[1] = -0.02
+    before = problem.full.state()
+    u.interpolate(lambda x: np.vstack([1.0 + 0.0 * x[0], 0.0 * x[0]]))
+    for contact in contacts:
+        contact.evaluate()
+    forces, start = problem.full.contact_forces(), problem.solver.equations.start
+    found = find_ejected_bodies(problem.full, problem.motions, forces, before, start)
+    assert [close(np.array(ways), (1.0, 0.06, 0.02), 1e-12) for ways in found.values()] == [True]
 
 
 @pytest.mark.parametrize(("way", "is_ejected"), [(2.5, False), (3.5, True)])

@@ -115,9 +115,8 @@ class Verdict:
             deform by more than five times its size.
         deformation: By body, the largest displacement without rigid-body motion, divided by the
             size of the body or the range of its Dirichlet values, whichever is larger.
-        ejected_bodies: By body without contact force that is ejected its displacement, along
-            directions that no contact normal has a part in, the largest one accepted, and the
-            largest displacement nearby (length).
+        ejected_bodies: By body without contact force that is ejected its displacement, the largest
+            one accepted, and the largest displacement nearby (length).
         friction_energy_gain: Energy supplied by friction, relative to the energy exchanged.
         inverted: Whether cells of a nonlinear bulk are inverted, det(I + grad u) ≤ 0.
         cross_check: By contact, the largest difference of its nodal forces from those that DOLFINx
@@ -273,9 +272,9 @@ class Verdict:
             found.append(Condition(f"deformation, {name}", value, _MOST_DEFORMED, failure))
         for name, (way, limit, others) in self.ejected_bodies.items():
             failure = (
-                f"{name} is ejected: it has moved by {way:.2g} across the contact normals and has "
-                f"no contact force, while nothing near has moved by more than {others:.2g}, or "
-                "deformed by it. Use smaller increments "
+                f"{name} is ejected: it has moved by {way:.2g} and has no contact force, while "
+                f"nothing near has moved, deformed, or pushed it, by more than {others:.2g}. Use "
+                "smaller increments "
                 "(increments() halves them where needed), start with the bodies in contact, or "
                 "constrain it by a weak spring"
             )

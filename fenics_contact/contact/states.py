@@ -105,9 +105,13 @@ class ContactStates:
 
         The history is not changed.
         """
+        self._values = self.at_present()
+
+    def at_present(self) -> PointValues:
+        """The same, with the last evaluation left as it is. Collective."""
         self._opposite.update()
         arrays = {**self._opposite.data.values, **self._acting.own.evaluate()}
-        self._values = PointValues.of(arrays | self._opposite.told(arrays))
+        return PointValues.of(arrays | self._opposite.told(arrays))
 
     def forget(self) -> None:
         """Discard the last evaluation: the next access to a result evaluates the present ``u``."""

@@ -11,9 +11,9 @@ import scipy.linalg
 
 from fenics_contact.contact.opposite import ObstacleMotion
 from fenics_contact.contact.values import Status
-from fenics_contact.methods.linear_programmes import least_sum, linear_programme
 from fenics_contact.parallel import agreed, gather_rows, global_max, global_min, global_sum
 from fenics_contact.systems.full import FullSystem
+from fenics_contact.systems.linear_programmes import least_sum, linear_programme
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes, tangential_gram
 from fenics_contact.tolerances import FLAT, NEGLIGIBLE
 from fenics_contact.types import Array, Index, Mask
@@ -255,10 +255,9 @@ class Approach:
     def _move(self, which: Index, coefficients: Array) -> None:
         """Let free motions of these numbers go on from here, by their coefficients. Collective."""
         full, motions = self._full, self._motions
-        if full.bulk.linear:
-            way = coefficients @ motions.fields[which]
-        else:
-            way = motions.turned(coefficients @ motions.free[which])
+        every = np.zeros(len(motions.free))
+        every[which] = coefficients
+        way = motions.displaced(every, linear=full.bulk.linear)
         self._go(full.state() + np.where(full.constrained, 0.0, way))
 
     def _to_first_touch(self, free: _Free) -> Array | None:

@@ -12,10 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from fenics_contact.methods.equations import Equations
-from fenics_contact.methods.linear_programmes import least_sum
-from fenics_contact.parallel import agreed, gather_rows, global_max, global_sum
 from fenics_contact.systems.full import FullSystem
-from fenics_contact.systems.rigid_body_modes import RigidBodyModes
+from fenics_contact.systems.least_motion import least_motion
 from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
 
@@ -36,6 +34,7 @@ def move_least(equations: Equations) -> None:
         equations: With a solution in ``u``.
     """
     full, motions, system = equations.full, equations.motions, equations.system
+    linear = full.bulk.linear
     if not len(motions.free):
         return
     committed = [contact.states.committed.points for contact in full.contacts]
@@ -45,13 +44,12 @@ def move_least(equations: Equations) -> None:
         return
     solution, moved = full.state(), False
     for _ in range(_STEPS):
-        change = _least_change(full, motions, ways, _since(equations))
-        if change is None:
+        present = [contact.values for contact in full.contacts]
+        since = motions.fitted(full.state() - equations.began, system.part, linear=linear)
+        change = least_motion(full, motions, ways, present, since, clears=False)
+        if change is None or np.abs(change).max() <= NEGLIGIBLE * full.scales.mesh_size:
             break
-        if full.bulk.linear:  # to which small rotations alone are rigid
-            way = change @ motions.fields
-        else:
-            way = motions.turned(change @ motions.free)
+        way = motions.displaced(change, linear=linear)
         _go(full, full.state() + np.where(full.constrained, 0.0, way))
         moved = True
     if not moved:
@@ -66,51 +64,3 @@ def _go(full: FullSystem, state: Array) -> None:
     full.set_state(state)
     for contact in full.contacts:
         contact.evaluate()
-
-
-def _since(equations: Equations) -> Array:
-    """How far every free motion has gone in the increment, (n_free,). Collective."""
-    full, motions, system = equations.full, equations.motions, equations.system
-    fields = motions.fields if full.bulk.linear else motions.present_fields()
-    fields = np.array([system.part(field) for field in fields])
-    change = system.part(full.state() - equations.began)
-    sums = global_sum(full.unknowns.comm, np.column_stack([fields @ fields.T, fields @ change]))
-    return np.asarray(np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=NEGLIGIBLE)[0])
-
-
-def _least_change(
-    full: FullSystem, motions: RigidBodyModes, ways: Array, since: Array
-) -> Array | None:
-    """Change of the free motions with which the increment moves bodies least. Collective.
-
-    Args:
-        full: The system, evaluated.
-        motions: The free motions.
-        ways: Those without force, (n_ways, n_free).
-        since: How far every free motion has gone in the increment, (n_free,).
-
-    Returns:
-        Array (n_free,); None: none is left, or there are no gaps that permit it.
-    """
-    comm = full.unknowns.comm
-    moving = np.any(ways != 0.0, axis=0)
-    far = np.abs(since[moving]).max(initial=0.0)
-    if not NEGLIGIBLE * full.scales.mesh_size < far < np.inf:
-        return None
-    rows = [np.zeros((0, len(ways) + 1))]
-    for number, operator in enumerate(full.operators):
-        contact, values = operator.contact, operator.contact.values
-        jumps = np.tensordot(ways, motions.at_points(operator), axes=1)
-        normal = np.where(np.isfinite(values.normal), values.normal, 0.0)
-        closing = np.einsum("mqd,qd->qm", jumps, normal)
-        felt = contact.paired & (np.abs(closing).max(axis=1, initial=0.0) > NEGLIGIBLE)
-        # No force acts along these motions: where one does they close no gap, but for round-off.
-        felt &= ~motions.acting(number, contact, values)[0]
-        gap = np.maximum(values.gap, 0.0)
-        rows.append(np.column_stack([closing, gap])[felt])
-    limits = gather_rows(comm, np.concatenate(rows))
-    found = least_sum(limits[:, :-1], limits[:, -1] / far, ways.T[moving], since[moving] / far)
-    found = agreed(comm, found)
-    if found is None or global_max(comm, np.abs(found)) * far <= NEGLIGIBLE * full.scales.mesh_size:
-        return None
-    return np.asarray(far * (found @ ways), dtype=np.float64)

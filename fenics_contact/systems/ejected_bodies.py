@@ -9,6 +9,7 @@ import numpy as np
 from fenics_contact.parallel import global_sum
 from fenics_contact.systems.balance import MOST_EXCUSED, InitialForces, by_body
 from fenics_contact.systems.full import FullSystem
+from fenics_contact.systems.least_motion import least_motion
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.tolerances import FLAT
 from fenics_contact.types import Array, Mask
@@ -18,9 +19,6 @@ __all__ = ["find_ejected_bodies"]
 # Largest displacement of a body by that of all others. Blocks ejected from between two others had
 # ten times as much; one that is let go springs back by as much as it changes its shape.
 _MAX_RATIO = 3.0
-# Mean square of the contact normals along a direction, from which on contact pushes along it: a
-# slope of one in thirty.
-_MIN_MEAN_SQUARE = 1e-3
 
 
 def find_ejected_bodies(
@@ -33,9 +31,11 @@ def find_ejected_bodies(
     """Find bodies that no force acts on, far from where any has moved them. Collective.
 
     Such a body is in equilibrium wherever it is, and a Newton step that ejects it leaves no
-    residual. Along the contact normals bodies push each other as far as they spring back, or as
-    wedges do, many times as far. Along all other directions only friction takes a body along, as
-    far as what is near it moves: other bodies, obstacles, prescribed values.
+    residual. Friction takes it along as far as what is near it moves: other bodies, obstacles,
+    prescribed values. Contact pushes it as far as it has to go to get out of these, a wedge many
+    times as far as they move: the least motion from where it was, as the increment began, by which
+    the gaps to all else, where and as it is now, are no longer negative. A body for which there is
+    none bears force.
 
     Args:
         full: The system at its present state.
@@ -45,9 +45,8 @@ def find_ejected_bodies(
         start: Forces at that state.
 
     Returns:
-        By the name of a body its translation in the increment along directions that no contact
-        normal has a part in, the limit of it, and the largest displacement nearby, or change of its
-        shape (length).
+        By the name of a body its translation in the increment, the limit of it, and the largest
+        displacement nearby, change of its shape, or least motion (length).
     """
     scales, n = full.scales, full.scales.n_bodies
     loose = motions.unconstrained_bodies()
@@ -74,14 +73,40 @@ def find_ejected_bodies(
     nearby = np.maximum(largest, obstacles)
     for body in np.flatnonzero(unloaded):
         nearby[body] = around[scales.coupled_with(int(body))].max(initial=nearby[body])
-    limit = np.maximum(_MAX_RATIO * nearby, FLAT * scales.size)
-    if not np.any(unloaded & (np.linalg.norm(translation, axis=1) > limit)):
+    way, least = np.linalg.norm(translation, axis=1), FLAT * scales.size
+    if not np.any(unloaded & (way > np.maximum(_MAX_RATIO * nearby, least))):
         return {}
-    projection = _off_contact_normals(full, scales.is_unloaded(committed))
-    aside = np.linalg.norm(np.einsum("bij,bj->bi", projection, translation), axis=1)
-    rows = np.stack([aside, limit, nearby], axis=1).tolist()
-    ejected = np.flatnonzero(unloaded & (aside > limit))
+    nearby = np.maximum(nearby, _pushed(full, motions, unloaded, began))
+    limit = np.maximum(_MAX_RATIO * nearby, least)
+    rows = np.stack([way, limit, nearby], axis=1).tolist()
+    ejected = np.flatnonzero(unloaded & (way > limit))
     return {full.parts.names[body]: tuple(rows[body]) for body in ejected}
+
+
+def _pushed(full: FullSystem, motions: RigidBodyModes, bodies: Mask, began: Array) -> Array:
+    """How far what else has moved in an increment pushes bodies, (n_bodies,) (length). Collective.
+
+    Args:
+        full: The system at its present state.
+        motions: Rigid motions of the bodies.
+        bodies: Which of them are pushed, (n_bodies,).
+        began: The state in which the increment began.
+    """
+    nothing: Array = np.zeros(len(motions.free))
+    ways = np.eye(len(nothing))[motions.of_bodies_alone(bodies)]
+    if not len(ways):
+        return motions.size_by_body(nothing)
+    present, linear = full.state(), full.bulk.linear
+    since = motions.fitted(present - began, linear=linear) @ ways.T @ ways
+    back = motions.displaced(-since, linear=linear)
+    full.set_state(present + np.where(full.constrained, 0.0, back))
+    # Within an iteration the values of the contacts may be those of another state.
+    states = [contact.states.at_present() for contact in full.contacts]
+    full.set_state(present)
+    for contact in full.contacts:
+        contact.opposite.update()
+    least = least_motion(full, motions, ways, states, nothing, clears=True)
+    return motions.size_by_body(nothing if least is None else least)
 
 
 def _obstacle_displacements(full: FullSystem, change: Array) -> Array:
@@ -106,41 +131,3 @@ def _obstacle_displacements(full: FullSystem, change: Array) -> Array:
             length = np.linalg.norm(displacement, axis=1)
             found = np.maximum(found, scales.largest_at_points(number, length))
     return found
-
-
-def _off_contact_normals(full: FullSystem, unloaded: Mask) -> Array:
-    """Projections on the directions that the contact normals of a body have no part in. Collective.
-
-    Of its points that transmitted force at the last commit, on either side; of all that had an
-    opposite point if none did.
-
-    Args:
-        full: The system.
-        unloaded: Bodies without contact force at the last commit, (n_bodies,).
-
-    Returns:
-        Array (n_bodies, gdim, gdim).
-    """
-    n, d = full.scales.n_bodies, full.gdim
-    squares: Array = np.zeros((2, n, d, d))
-    for number, operator in enumerate(full.operators):
-        contact = operator.contact
-        points = contact.states.committed.points or contact.values
-        known = np.isfinite(points.normal).all(axis=1) & np.isfinite(points.normal_traction)
-        known &= points.paired > 0
-        normal = np.where(known[:, None], points.normal, 0.0)
-        area = np.where(known, contact.measure, 0.0)
-        force = area * np.where(known, np.abs(points.normal_traction), 0.0)
-        products = np.einsum("qi,qj->qij", normal, normal)
-        own, opposite = full.scales.sides[number]
-        # A body that a contact couples with itself counts once.
-        for body, counts in ((own, own < n), (opposite, (opposite != own) & (opposite < n))):
-            for which, weight in enumerate((force, area)):
-                share = weight[counts, None, None] * products[counts]
-                np.add.at(squares[which], body[counts], share)
-    squares = global_sum(full.unknowns.comm, squares)
-    chosen = np.where(unloaded[:, None, None], squares[1], squares[0])
-    total = np.trace(chosen, axis1=1, axis2=2)[:, None, None]
-    mean, axes = np.linalg.eigh(chosen / np.where(total > 0, total, 1.0))
-    axes = np.where((mean < _MIN_MEAN_SQUARE)[:, None, :], axes, 0.0)
-    return np.asarray(axes @ axes.swapaxes(1, 2))

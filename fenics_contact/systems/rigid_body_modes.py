@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import scipy.linalg
@@ -178,6 +178,23 @@ class RigidBodyModes:
         bodies, _ = self._moved()
         return np.asarray(bodies.any(axis=0))
 
+    def of_bodies_alone(self, bodies: Mask) -> Index:
+        """Numbers of the free motions that move some of these bodies and nothing else."""
+        moves, obstacles = self._moved()
+        return np.flatnonzero(
+            moves.any(axis=1) & ~moves[:, ~bodies].any(axis=1) & ~obstacles.any(axis=1)
+        )
+
+    def size_by_body(self, coefficients: Array) -> Array:
+        """At most how far free motions displace every body, (n_bodies,) (length).
+
+        Args:
+            coefficients: Of the free motions, (n_free,) (length).
+        """
+        n_bodies, n_motions, _ = self.of_bodies.shape
+        of_each = np.abs(coefficients @ self.free)[: n_bodies * n_motions]
+        return np.asarray(of_each.reshape(n_bodies, n_motions).sum(axis=1))
+
     def present_fields(self) -> Array:
         """The same of the bodies where they are now, about the same centres."""
         return np.asarray(self.free @ self._modes_at(self._places()), dtype=np.float64)
@@ -186,6 +203,30 @@ class RigidBodyModes:
         """Of this rank's nodes now, (n_nodes, gdim) (length)."""
         n, d = self._x.shape
         return self._x + self._displacement.u.x.array[: n * d].reshape(n, d)
+
+    def fitted(
+        self, change: Array, part: Callable[[Array], Array] = np.asarray, *, linear: bool
+    ) -> Array:
+        """The free motions nearest to a change of this rank's unknowns, (n_free,). Collective.
+
+        Args:
+            change: The change.
+            part: Takes those unknowns that are compared.
+            linear: Whether rotations are those of the undeformed bodies.
+        """
+        fields = np.array([part(f) for f in (self.fields if linear else self.present_fields())])
+        sums = global_sum(self.comm, np.column_stack([fields @ fields.T, fields @ part(change)]))
+        found = np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=NEGLIGIBLE)[0]
+        return np.asarray(agreed(self.comm, found), dtype=np.float64)
+
+    def displaced(self, coefficients: Array, *, linear: bool) -> Array:
+        """By how much unknowns change as free motions go on from here, (n_local,).
+
+        Args:
+            coefficients: Of the free motions, (n_free,).
+            linear: Whether rotations are small, those of the undeformed bodies.
+        """
+        return coefficients @ self.fields if linear else self.turned(coefficients @ self.free)
 
     def turned(self, coefficients: Array) -> Array:
         """By how much unknowns change as bodies go on, and turn about their centres, from here.
