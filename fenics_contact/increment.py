@@ -18,10 +18,10 @@ from fenics_contact.failure import NotConverged
 from fenics_contact.methods.approach import Approach
 from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.first_touch import FirstTouch
-from fenics_contact.methods.least_motion import move_least
 from fenics_contact.methods.load_balance import LoadBalance
 from fenics_contact.methods.opposite_points import OppositePoints
 from fenics_contact.methods.solver import Solver
+from fenics_contact.methods.unloaded_bodies import move_unloaded_bodies
 from fenics_contact.parallel import global_max
 from fenics_contact.state import State, Trial
 from fenics_contact.step import Step
@@ -182,8 +182,9 @@ class IncrementSolver:
             solver.system.complete(solver.system.pending_field)
         for contact in self._contacts:
             contact.evaluate()
-        if reason > 0:
-            move_least(solver.equations)
+        part = solver.system.part if lags else np.asarray
+        if reason > 0 and move_unloaded_bodies(solver.equations, part) and solver.starts.factored:
+            solver.starts.note_borne()
         increment.tried += attempts
         if reason <= 0 and points.drop_prediction():
             return increment.ends(Again.FROM_COMMITTED)

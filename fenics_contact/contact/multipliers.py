@@ -33,7 +33,7 @@ from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.mass import mass_solver
 from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.tolerances import ROUND_OFF
-from fenics_contact.types import Array, Index
+from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Multipliers", "TraceProjection"]
 
@@ -258,6 +258,15 @@ class Multipliers:
         """Begin the rounds with a share of λ_n; λ_t, which friction has come to, stays."""
         values = {name: self.fields.values(name) for name in ("pressure", *self._vectors)}
         self.fields.assign(values | {"pressure": share * values["pressure"]})
+
+    def drop(self, idle: Mask) -> None:
+        """Forget the multipliers of the parts of Γc of which no point bears force. Collective.
+
+        Args:
+            idle: Which points bear none, (n_points,).
+        """
+        bears = self._largest(np.where(idle, 0.0, 1.0))[self._patch] > 0.0
+        self.fields.set_rows(np.where(bears[:, None], self.fields.rows(), 0.0))
 
     def update(self, values: PointValues) -> None:
         """Make the tractions of an evaluated contact the multipliers, and go on. Collective."""

@@ -105,10 +105,10 @@ class ContactStates:
 
         The history is not changed.
         """
-        self._values = self.at_present()
+        self._values = self.evaluate_present()
 
-    def at_present(self) -> PointValues:
-        """The same, with the last evaluation left as it is. Collective."""
+    def evaluate_present(self) -> PointValues:
+        """Evaluate them without a change of `values`. Collective."""
         self._opposite.update()
         arrays = {**self._opposite.data.values, **self._acting.own.evaluate()}
         return PointValues.of(arrays | self._opposite.told(arrays))

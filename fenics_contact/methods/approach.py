@@ -8,12 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
 
 from fenics_contact.contact.opposite import ObstacleMotion
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import agreed, gather_rows, global_max, global_min, global_sum
 from fenics_contact.systems.full import FullSystem
-from fenics_contact.systems.linear_programmes import least_sum, linear_programme
+from fenics_contact.systems.least_motion import minimise_norm
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes, tangential_gram
 from fenics_contact.tolerances import FLAT, NEGLIGIBLE
 from fenics_contact.types import Array, Index, Mask
@@ -234,12 +235,9 @@ class Approach:
         Returns:
             (n_free, n_local), and for every contact (n_free, n_points, gdim).
         """
-        full, motions = self._full, self._motions
-        if full.bulk.linear:  # to which small rotations alone are rigid
-            jumps = [motions.at_points(operator)[which] for operator in full.operators]
-            return motions.fields[which], jumps
-        fields = motions.present_fields()[which]
-        return fields, [np.array([o.jump(field) for field in fields]) for o in full.operators]
+        full = self._full
+        fields, at_points = self._motions.present(full.operators, linear=full.bulk.linear)
+        return fields[which], [jumps[which] for jumps in at_points]
 
     def _free(self, load: Array, which: Index) -> _Free | None:
         """The free motions of these numbers; None: the load drives none. Collective."""
@@ -257,7 +255,7 @@ class Approach:
         full, motions = self._full, self._motions
         every = np.zeros(len(motions.free))
         every[which] = coefficients
-        way = motions.displaced(every, linear=full.bulk.linear)
+        way = motions.displacement(every, linear=full.bulk.linear)
         self._go(full.state() + np.where(full.constrained, 0.0, way))
 
     def _to_first_touch(self, free: _Free) -> Array | None:
@@ -369,15 +367,28 @@ class Approach:
         # What was let go, obstacles may have moved into: it goes out, or no deeper where it cannot.
         for deep in (gaps, np.maximum(gaps, NEGLIGIBLE)):
             limit = np.concatenate([deep, ends])
-            found = linear_programme(-work, matrix, limit)
+            found = agreed(comm, _maximise(work, matrix, limit))
             if found is not None or gaps.min() >= 0:
                 break
         if found is None:
             return None
         # A body without load, which others may push, is free to go anywhere that gaps permit: it
-        # stays. It gives back no more than a tenth of what bodies are set down deeper than to
+        # moves least. It gives back no more than a tenth of what bodies are set down deeper than to
         # touch.
         least_work = (1.0 - 0.1 * NEGLIGIBLE) * float(work @ found)
         matrix, limit = np.vstack([matrix, -work]), np.append(limit, [-least_work])
-        least = least_sum(matrix, limit, np.eye(len(work)), np.zeros(len(work)))
-        return far * (ways @ agreed(comm, found if least is None else least))
+        mass = ways.T @ free.mass @ ways
+        least = agreed(comm, minimise_norm(mass, np.zeros(len(work)), matrix, limit))
+        return far * (ways @ (found if least is None else least))
+
+
+def _maximise(work: Array, matrix: Array, limit: Array) -> Array | None:
+    """Maximise work @ x where matrix @ x <= limit; None: there is no such x, or no most."""
+    found = scipy.optimize.linprog(
+        -work,
+        A_ub=matrix,
+        b_ub=limit,
+        bounds=(None, None),
+        options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
+    )
+    return found.x if found.status == 0 else None

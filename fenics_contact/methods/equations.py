@@ -61,7 +61,7 @@ class Equations:
         factorisations: Of sparse matrices, counted.
         loads: The largest generalised force of the load on rigid-body modes, (n_groups,) (force).
         regularised_modes: Rigid-body modes along which the consistent tangent assembled last is
-            regularised, in free motions, (n_modes, n_free).
+            regularised, at this rank's unknowns, (n_modes, n_local).
         overload: By what the load outdid friction where `friction_needed` looked last, if it did.
     """
 
@@ -233,7 +233,7 @@ class Equations:
         """
         filled = {c for c, m in self._matrices.items() if m.handle == matrix.handle}
         if True in filled:  # unless ``contacts``, made while the matrix is filled, are regularised
-            self.regularised_modes = np.zeros((0, len(self.motions.free)))
+            self.regularised_modes = np.zeros((0, 0))
         self.factorisations += self.system.fill(matrix, contacts)
         self.has_round_off = True
         if self.system.pattern_changes:
@@ -292,11 +292,11 @@ class Equations:
         """
         full, modes = self.full, self._loose_modes()
         if modes is None or np.isnan(modes.share).all():
-            self.regularised_modes = np.zeros((0, len(self.motions.free)))
+            self.regularised_modes = np.zeros((0, 0))
             yield from self.tangents()
             return
         free = ~np.isnan(modes.share)
-        self.regularised_modes = modes.ways
+        self.regularised_modes = modes.ways @ self.motions.fields
         share = np.where(free, np.maximum(modes.share, _LEAST_SHARE), 0.0)
         operators = self.system.operators
         within = [operator.within for operator in operators]

@@ -85,6 +85,10 @@ class Starts:
             predict: See the attribute.
         """
         self.factored, self.predict = True, predict
+        self.note_borne()
+
+    def note_borne(self) -> None:
+        """Take note of what contacts bear, in the solution or where it has moved. Collective."""
         self._borne = []
         contacts = self._equations.contacts
         if not any(c.opposite.carries for c in contacts):
@@ -231,7 +235,7 @@ class Starts:
         found = ksp.getConvergedReason() > 0
         linear.forget_failure(ksp.getPC())
         if not anew:
-            self._without_regularised_modes(full, step)
+            self._remove_regularised_modes(full, step)
         full.set_state(present)
         full.update_stiffness()
         return present + step.array_r if found else present
@@ -266,7 +270,7 @@ class Starts:
         dense.raise_kept(ksp)
         found = ksp.getConvergedReason() > 0
         linear.forget_failure(ksp.getPC())
-        self._without_regularised_modes(system, step)
+        self._remove_regularised_modes(system, step)
         moved: Array | None = present - step.array_r if found else None
         for vector in (forces, step):
             vector.destroy()
@@ -297,18 +301,16 @@ class Starts:
             tractions.append(traction)
         return tractions if moved else None
 
-    def _without_regularised_modes(self, system: System, step: PETSc.Vec) -> None:
+    def _remove_regularised_modes(self, system: System, step: PETSc.Vec) -> None:
         """Take the modes along which the tangent was regularised out of a step on it. Collective.
 
         At a solution next to nothing is left of what regularises the tangent along such a mode: a
         step by it may go any distance. All else of the step is right.
         """
         equations = self._equations
-        ways, motions = equations.regularised_modes, equations.motions
-        if not len(ways):
+        if not len(equations.regularised_modes):
             return
-        fields = motions.fields if equations.full.bulk.linear else motions.present_fields()
-        modes = np.array([system.part(way) for way in ways @ fields])
+        modes = np.array([system.part(mode) for mode in equations.regularised_modes])
         modes[:, system.constrained] = 0.0
         sums = np.column_stack([modes @ modes.T, modes @ step.array_r])
         sums = global_sum(equations.full.unknowns.comm, sums)

@@ -9,7 +9,7 @@ import numpy as np
 from fenics_contact.parallel import global_sum
 from fenics_contact.systems.balance import MOST_EXCUSED, InitialForces, by_body
 from fenics_contact.systems.full import FullSystem
-from fenics_contact.systems.least_motion import least_motion
+from fenics_contact.systems.least_motion import find_least_motion
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.tolerances import FLAT
 from fenics_contact.types import Array, Mask
@@ -93,19 +93,20 @@ def _pushed(full: FullSystem, motions: RigidBodyModes, bodies: Mask, began: Arra
         began: The state in which the increment began.
     """
     nothing: Array = np.zeros(len(motions.free))
-    ways = np.eye(len(nothing))[motions.of_bodies_alone(bodies)]
-    if not len(ways):
+    modes = np.eye(len(nothing))[motions.of_bodies_alone(bodies)]
+    if not len(modes):
         return motions.size_by_body(nothing)
     present, linear = full.state(), full.bulk.linear
-    since = motions.fitted(present - began, linear=linear) @ ways.T @ ways
-    back = motions.displaced(-since, linear=linear)
+    since = motions.fit(present - began, np.asarray, linear=linear) @ modes.T @ modes
+    back = motions.displacement(-since, linear=linear)
     full.set_state(present + np.where(full.constrained, 0.0, back))
-    # Within an iteration the values of the contacts may be those of another state.
-    states = [contact.states.at_present() for contact in full.contacts]
+    # Within an iteration the values of the contacts are kept: they may be of another state.
+    states = [contact.states.evaluate_present() for contact in full.contacts]
+    every = [np.ones(len(values.gap), np.bool_) for values in states]
+    least = find_least_motion(full, motions, modes, states, nothing, every)
     full.set_state(present)
     for contact in full.contacts:
         contact.opposite.update()
-    least = least_motion(full, motions, ways, states, nothing, clears=True)
     return motions.size_by_body(nothing if least is None else least)
 
 

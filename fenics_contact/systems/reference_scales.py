@@ -195,11 +195,10 @@ class ReferenceScales:
 
         Args:
             number: Of the contact.
-            forces: Sizes of forces there, (..., n_points) (force).
+            forces: Sizes of forces there, (n_points,) (force).
         """
         group, largest = self.group_of_points(number), np.zeros(self.n_groups)
-        sizes = np.where(np.isfinite(forces), forces, 0.0).reshape(-1, len(group))
-        np.maximum.at(largest, group, sizes.max(axis=0, initial=0.0))
+        np.maximum.at(largest, group, np.where(np.isfinite(forces), forces, 0.0))
         self._comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
         return np.asarray(np.maximum(self.round_off_of_groups, NEGLIGIBLE * largest)[group])
 

@@ -185,6 +185,16 @@ class RigidBodyModes:
             moves.any(axis=1) & ~moves[:, ~bodies].any(axis=1) & ~obstacles.any(axis=1)
         )
 
+    def move_any(self, modes: Array, bodies: Mask) -> Mask:
+        """Which modes move some of these bodies, (n_modes,).
+
+        Args:
+            modes: In free motions, (n_modes, n_free).
+            bodies: (n_bodies,).
+        """
+        moves, _ = self._moved()
+        return np.asarray((modes != 0.0) @ moves[:, bodies].any(axis=1))
+
     def size_by_body(self, coefficients: Array) -> Array:
         """At most how far free motions displace every body, (n_bodies,) (length).
 
@@ -204,27 +214,44 @@ class RigidBodyModes:
         n, d = self._x.shape
         return self._x + self._displacement.u.x.array[: n * d].reshape(n, d)
 
-    def fitted(
-        self, change: Array, part: Callable[[Array], Array] = np.asarray, *, linear: bool
-    ) -> Array:
-        """The free motions nearest to a change of this rank's unknowns, (n_free,). Collective.
+    def present(
+        self, operators: Sequence[ContactOperator], *, linear: bool
+    ) -> tuple[Array, list[Array]]:
+        """The free motions at this rank's unknowns, and at points of contacts. Collective.
+
+        Args:
+            operators: Of the contacts, over all unknowns.
+            linear: Whether they are those of the undeformed bodies: to a linear bulk small
+                rotations alone are rigid.
+
+        Returns:
+            (n_free, n_local), and for every contact their jumps, (n_free, n_points, gdim).
+        """
+        if linear:
+            return self.fields, [self.at_points(operator) for operator in operators]
+        fields, shape = self.present_fields(), (len(self.free), -1, self._x.shape[1])
+        found = [np.array([o.jump(field) for field in fields]) for o in operators]
+        return fields, [jumps.reshape(shape) for jumps in found]
+
+    def fit(self, change: Array, part: Callable[[Array], Array], *, linear: bool) -> Array:
+        """Find the free motions nearest to a change of this rank's unknowns, (n_free,). Collective.
 
         Args:
             change: The change.
             part: Takes those unknowns that are compared.
-            linear: Whether rotations are those of the undeformed bodies.
+            linear: As in `present`.
         """
         fields = np.array([part(f) for f in (self.fields if linear else self.present_fields())])
         sums = global_sum(self.comm, np.column_stack([fields @ fields.T, fields @ part(change)]))
         found = np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=NEGLIGIBLE)[0]
         return np.asarray(agreed(self.comm, found), dtype=np.float64)
 
-    def displaced(self, coefficients: Array, *, linear: bool) -> Array:
+    def displacement(self, coefficients: Array, *, linear: bool) -> Array:
         """By how much unknowns change as free motions go on from here, (n_local,).
 
         Args:
             coefficients: Of the free motions, (n_free,).
-            linear: Whether rotations are small, those of the undeformed bodies.
+            linear: As in `present`; otherwise rotations are of any size.
         """
         return coefficients @ self.fields if linear else self.turned(coefficients @ self.free)
 
@@ -375,44 +402,53 @@ class RigidBodyModes:
         gram, area = global_sum(self.comm, gram), global_sum(self.comm, area)
         return self._null_space(gram, area, rows)
 
-    def unloaded(
+    def find_unloaded(
         self,
         operators: Sequence[ContactOperator],
         states: Sequence[Sequence[PointValues | None]],
+        *,
+        linear: bool,
     ) -> Array:
-        """Along which free motions no force of contact acts, (n_unloaded, n_free). Collective.
+        """Find the modes along which no contact force acts, (n_unloaded, n_free). Collective.
 
-        None but round-off, in any of some states. Friction acts in all directions along Γc as far
-        as its bound goes.
+        None but round-off, in any of some states. Friction acts in all directions along Γc. Where
+        points that bore force have no opposite point any more, nothing is known of what was there:
+        none of that group of coupled bodies counts.
 
         Args:
             operators: Of the contacts, over all unknowns.
-            states: Values at the points of every contact in each; None: it bore nothing.
+            states: Values at the points of every contact in each; None: there was no force.
+            linear: As in `present`.
         """
-        n = len(self.free)
+        n, scales = len(self.free), self._scales
         gram: Array = np.zeros((n, n))
         area: Array = np.zeros(n)
-        for number, operator in enumerate(operators):
-            contact = operator.contact
-            modes, weights = self.at_points(operator), contact.quadrature.weights
+        unknown: Array = np.zeros(scales.n_groups)
+        at_points = self.present(operators, linear=linear)[1]
+        for number, (operator, modes) in enumerate(zip(operators, at_points, strict=True)):
+            contact, weights = operator.contact, operator.contact.quadrature.weights
             felt = np.abs(modes).max(axis=2, initial=0.0) > NEGLIGIBLE
             area += felt @ weights
+            group = scales.group_of_points(number)
             for values in (state[number] for state in states):
                 if values is None:
                     continue
-                acts = self.acting(number, contact, values)
+                acts = self.has_force(number, contact, values)
                 normal = np.where(np.isfinite(values.normal), values.normal, 0.0)
                 along = np.einsum("mqd,qd->mq", modes, normal)
                 across = modes - along[:, :, None] * normal
                 gram += (along * (weights * acts[0])) @ along.T
                 gram += np.einsum("mqd,q,nqd->mn", across, weights * acts[1], across)
-        gram, area = global_sum(self.comm, gram), global_sum(self.comm, area)
-        return self._null_space(gram, area, np.arange(n))
+                unknown[group[acts.any(axis=0) & (values.paired > 0) & ~contact.paired]] = 1.0
+        gram, area, unknown = (global_sum(self.comm, part) for part in (gram, area, unknown))
+        found = self._null_space(gram, area, np.arange(n))
+        return found[~((found != 0.0) @ (unknown[self.groups()] > 0.0))]
 
-    def acting(self, number: int, contact: Contact, values: PointValues) -> Mask:
+    def has_force(self, number: int, contact: Contact, values: PointValues) -> Mask:
         """Whether forces act at points, but for round-off: normal ones and friction, (2, n_points).
 
-        That of friction is as large as its bound. Collective.
+        That of friction is as large as its bound. A law that bears tension acts at all points with
+        an opposite. Collective.
 
         Args:
             number: Of the contact.
@@ -422,7 +458,8 @@ class RigidBodyModes:
         friction = np.maximum(np.linalg.norm(values.traction, axis=1), values.friction_bound)
         forces = contact.measure * np.array([np.abs(values.normal_traction), friction])
         forces[np.isnan(forces)] = 0.0
-        return np.asarray(forces > self._scales.round_off_at_points(number, forces))
+        acts = forces > self._scales.round_off_at_points(number, forces.max(axis=0))
+        return np.asarray(acts | (contact.law.has_tension & (values.paired > 0)))
 
     def _null_space(self, gram: Array, area: Array, rows: Index) -> Array:
         """Combinations of free motions that a sum over points does not feel, (n_found, n_rows).
