@@ -61,7 +61,7 @@ class Equations:
         factorisations: Of sparse matrices, counted.
         loads: The largest generalised force of the load on rigid-body modes, (n_groups,) (force).
         regularised_modes: Rigid-body modes along which the consistent tangent assembled last is
-            regularised, at this rank's unknowns, (n_modes, n_local).
+            regularised, in all motions, (n_modes, n_motions).
         overload: By what the load outdid friction where `friction_needed` looked last, if it did.
     """
 
@@ -296,7 +296,7 @@ class Equations:
             yield from self.tangents()
             return
         free = ~np.isnan(modes.share)
-        self.regularised_modes = modes.ways @ self.motions.fields
+        self.regularised_modes = modes.ways @ self.motions.free
         share = np.where(free, np.maximum(modes.share, _LEAST_SHARE), 0.0)
         operators = self.system.operators
         within = [operator.within for operator in operators]

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from petsc4py import PETSc
 
 from fenics_contact.contact.point_law import PointTangent
 from fenics_contact.contact.values import PointValues
 from fenics_contact.methods.equations import Equations
 from fenics_contact.parallel import agreed, global_max, global_sum
 from fenics_contact.systems import dense, linear
+from fenics_contact.systems.least_motion import find_least_motion
 from fenics_contact.systems.system import System
 from fenics_contact.tolerances import FLAT, NEGLIGIBLE
 from fenics_contact.types import Array
@@ -234,11 +234,12 @@ class Starts:
         ksp.solve(image, step)
         found = ksp.getConvergedReason() > 0
         linear.forget_failure(ksp.getPC())
-        if not anew:
-            self._remove_regularised_modes(full, step)
         full.set_state(present)
         full.update_stiffness()
-        return present + step.array_r if found else present
+        if not found:
+            return present
+        way: Array = step.array.copy()
+        return present + (way if anew else self._without_regularised_modes(full, present, way))
 
     def _stepped(self, present: Array, tractions: list[Array] | None) -> Array | None:
         """One Newton step on the tangent factored last. Collective.
@@ -270,11 +271,10 @@ class Starts:
         dense.raise_kept(ksp)
         found = ksp.getConvergedReason() > 0
         linear.forget_failure(ksp.getPC())
-        self._remove_regularised_modes(system, step)
-        moved: Array | None = present - step.array_r if found else None
+        way: Array = -step.array_r
         for vector in (forces, step):
             vector.destroy()
-        return moved
+        return present + self._without_regularised_modes(system, present, way) if found else None
 
     def _tractions(self) -> list[Array] | None:
         """Those of the last solution, as moved obstacles would change them to first order.
@@ -301,18 +301,38 @@ class Starts:
             tractions.append(traction)
         return tractions if moved else None
 
-    def _remove_regularised_modes(self, system: System, step: PETSc.Vec) -> None:
-        """Take the modes along which the tangent was regularised out of a step on it. Collective.
+    def _without_regularised_modes(self, system: System, present: Array, way: Array) -> Array:
+        """Replace in a step the modes along which its tangent was regularised. Collective.
 
         At a solution next to nothing is left of what regularises the tangent along such a mode: a
-        step by it may go any distance. All else of the step is right.
+        step by it may go any distance. All else of the step is right, and pushes bodies along these
+        modes as far as gaps close by it.
+
+        Args:
+            system: The system.
+            present: The state from which the step is.
+            way: The step.
         """
-        equations = self._equations
-        if not len(equations.regularised_modes):
-            return
-        modes = np.array([system.part(mode) for mode in equations.regularised_modes])
-        modes[:, system.constrained] = 0.0
-        sums = np.column_stack([modes @ modes.T, modes @ step.array_r])
-        sums = global_sum(equations.full.unknowns.comm, sums)
-        share = np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=NEGLIGIBLE)[0]
-        step.array[:] -= agreed(equations.full.unknowns.comm, share) @ modes
+        equations, full, motions = self._equations, self._equations.full, self._equations.motions
+        modes = motions.in_free(equations.regularised_modes)
+        if not len(modes):
+            return way
+        comm = full.unknowns.comm
+        every = motions.fields if full.bulk.linear else motions.present_fields()
+        every = np.array([system.part(np.where(full.constrained, 0.0, field)) for field in every])
+        fields = modes @ every
+        sums = global_sum(comm, np.column_stack([fields @ fields.T, fields @ way]))
+        share = agreed(comm, np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=NEGLIGIBLE)[0])
+        way = way - share @ fields
+        system.set_state(present)
+        states, bear, closed = [], [], []
+        for number, operator in enumerate(system.operators):
+            contact, values = operator.contact, operator.contact.states.evaluate_present()
+            committed = contact.states.committed.points or values
+            bear.append(motions.has_force(number, contact, committed)[0])
+            normal = np.where(np.isfinite(values.normal), values.normal, 0.0)
+            closed.append(np.einsum("qd,qd->q", operator.jump(way), normal))
+            states.append(values)
+        nothing, among = np.zeros(len(motions.free)), [~each for each in bear]
+        pushed = find_least_motion(full, motions, modes, states, nothing, among, closed)
+        return way if pushed is None else way + pushed @ every

@@ -37,6 +37,7 @@ def find_least_motion(
     states: Sequence[PointValues],
     displacement: Array,
     among: Sequence[Mask],
+    closed: Sequence[Array] | None = None,
 ) -> Array | None:
     """Find by how much modes are to change, so that the motion is least and no gap is negative.
 
@@ -49,6 +50,7 @@ def find_least_motion(
         states: Of every contact the values at its points there.
         displacement: The motion made by then, in free motions, (n_free,) (length).
         among: Masks of the points that count, (n_points,) each.
+        closed: By how much gaps are smaller by now than in ``states``, (n_points,) each (length).
 
     Returns:
         Change in free motions, (n_free,) (length); None: none leaves no gap negative.
@@ -56,16 +58,18 @@ def find_least_motion(
     comm, least = full.unknowns.comm, NEGLIGIBLE * full.scales.mesh_size
     fields, at_points = motions.present(full.operators, linear=full.bulk.linear)
     rows = [np.zeros((0, len(modes) + 1))]
-    for operator, jumps, values, mine in zip(full.operators, at_points, states, among, strict=True):
+    closed = closed or [np.zeros(len(values.gap)) for values in states]
+    points = zip(full.operators, at_points, states, among, closed, strict=True)
+    for operator, jumps, values, mine, less in points:
         normal = np.where(np.isfinite(values.normal), values.normal, 0.0)
         closing = np.einsum("mqd,qd->qm", np.tensordot(modes, jumps, axes=1), normal)
-        felt = mine & (values.paired > 0) & np.isfinite(values.gap)
+        gap = values.gap - less
+        felt = mine & (values.paired > 0) & np.isfinite(gap)
         felt &= np.abs(closing).max(axis=1, initial=0.0) > NEGLIGIBLE
         felt &= operator.contact.law.has_normal_stiffness
         # A gap is left, so that round-off is no force; touching points are as near as they are.
-        touches = (values.gap <= least) & (values.gap >= -ROUND_OFF * full.scales.mesh_size)
-        apart = values.gap - least
-        rows.append(np.column_stack([closing, np.where(touches, 0.0, apart)])[felt])
+        touches = (gap <= least) & (gap >= -ROUND_OFF * full.scales.mesh_size)
+        rows.append(np.column_stack([closing, np.where(touches, 0.0, gap - least)])[felt])
     limits = gather_rows(comm, np.concatenate(rows))
     mass = global_sum(comm, fields @ fields.T)
     turns = motions.free * (motions.turns > 0.0)

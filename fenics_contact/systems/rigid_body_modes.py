@@ -185,6 +185,22 @@ class RigidBodyModes:
             moves.any(axis=1) & ~moves[:, ~bodies].any(axis=1) & ~obstacles.any(axis=1)
         )
 
+    def in_free(self, modes: Array) -> Array:
+        """A basis of those of some modes that are free now, in free motions, (n_modes, n_free).
+
+        Collective.
+
+        Args:
+            modes: In all motions, (n_given, n_motions).
+        """
+        if not (len(modes) and len(self.free)):
+            return np.zeros((0, len(self.free)))
+        found = np.linalg.lstsq(self.free.T, modes.T, rcond=None)[0].T
+        off = np.abs(found @ self.free - modes).max(axis=1)
+        _, sizes, basis = np.linalg.svd(found[off <= FLAT * np.abs(modes).max(axis=1)])
+        rank = np.count_nonzero(sizes > NEGLIGIBLE * sizes.max(initial=0.0))
+        return agreed(self.comm, np.asarray(basis[:rank], dtype=np.float64))
+
     def move_any(self, modes: Array, bodies: Mask) -> Mask:
         """Which modes move some of these bodies, (n_modes,).
 
