@@ -68,7 +68,7 @@ def find_ejected_bodies(
     shift = np.where(unloaded[:, None], translation, 0.0)
     other = change - np.where(full.constrained, 0.0, np.einsum("bd,bdi->i", shift, bodies))
     largest = scales.largest(np.where(np.any(bodies != 0.0, axis=(0, 1)), other, 0.0))
-    obstacles = _obstacle_displacements(full, change)
+    obstacles = np.maximum(_obstacle_displacements(full, change), _spring_lengths(full))
     around = np.where(unloaded, obstacles, np.maximum(largest, obstacles))
     nearby = np.maximum(largest, obstacles)
     for body in np.flatnonzero(unloaded):
@@ -108,6 +108,21 @@ def _pushed(full: FullSystem, motions: RigidBodyModes, bodies: Mask, began: Arra
     for contact in full.contacts:
         contact.opposite.update()
     return motions.size_by_body(nothing if least is None else least)
+
+
+def _spring_lengths(full: FullSystem) -> Array:
+    """Largest change of length of the contact springs at the last commit, (n_bodies,) (length).
+
+    A body that they are let go with springs back by it: one pulled by a bond, too. Collective.
+    """
+    found: Array = np.zeros(full.scales.n_bodies)
+    for number, contact in enumerate(full.contacts):
+        points = contact.states.committed.points
+        none = np.zeros(contact.quadrature.n_points)
+        bore = none if points is None else np.where(points.normal_traction != 0, points.gap, 0.0)
+        lengths = np.abs(np.where(np.isfinite(bore), bore, 0.0))
+        found = np.maximum(found, full.scales.largest_at_points(number, lengths))
+    return found
 
 
 def _obstacle_displacements(full: FullSystem, change: Array) -> Array:
