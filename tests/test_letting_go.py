@@ -672,7 +672,7 @@ class Pushed:
         {"angle": 0.7, "law": fc.Frictionless()},
         {"enforcement": "augmented"},
     ],
-    ids=lambda o: ", ".join(f"{k}" for k in o) or "plain",
+    ids=lambda options: ", ".join(options) or "plain",
 )
 @pytest.mark.parametrize(
     ("kinematics", "rubber"), [("small", False), ("finite", False), ("finite", True)]

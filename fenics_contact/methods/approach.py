@@ -96,9 +96,9 @@ class Approach:
         if first:
             here = full.state()
             with self._obstacles_at_start(before):
-                self._go(before)
+                self._full.evaluate_at(before)
                 untouched = np.union1d(untouched, self._untouched())
-            self._go(here)
+            self._full.evaluate_at(here)
         if len(untouched) < len(motions.free) and motions.turning:
             # Where bodies touch, an obstacle that turns freely follows in the iteration.
             untouched = untouched[motions.of_any_body()[untouched]]
@@ -122,12 +122,6 @@ class Approach:
         # What turns about a point does not move there.
         return np.flatnonzero(~(motions.of_same_body() @ (touched > 0)))
 
-    def _go(self, state: Array) -> None:
-        """Make a state the present one. Collective."""
-        self._full.set_state(state)
-        for contact in self._full.contacts:
-            contact.evaluate()
-
     def _set_down(self, load: Array, before: Array, which: Index) -> None:
         """Move bodies that touch nothing to where they rest, or to first touch. Collective.
 
@@ -148,12 +142,12 @@ class Approach:
         if len(of_bodies) and any(contact.law.has_friction for contact in full.contacts):
             along = None
             with self._obstacles_at_start(before) as motions:
-                self._go(np.where(full.constrained, before, aloft))
+                self._full.evaluate_at(np.where(full.constrained, before, aloft))
                 if self._find_rest_position(load, which):
                     along = self._fit_obstacle_motion(which, motions)
                     for contact, jumps in zip(full.contacts, self._felt(of_bodies)[1], strict=True):
                         contact.states.set_down(_feeling(jumps))
-            self._go(aloft)
+            self._full.evaluate_at(aloft)
             if along is not None:
                 self._move(which, along)
         self._find_rest_position(load, which)
@@ -195,7 +189,7 @@ class Approach:
         Yields:
             Motion in the increment of the obstacle of every contact.
         """
-        self._go(before)
+        self._full.evaluate_at(before)
         contacts = self._full.contacts
         motions = [contact.opposite.motion_in_increment(contact.values) for contact in contacts]
         with contextlib.ExitStack() as back:
@@ -217,7 +211,7 @@ class Approach:
         for along in (_ALONG, np.inf):
             if self._lands(load, which, along):
                 return True
-            self._go(here)
+            self._full.evaluate_at(here)
         free = self._free(load, which)
         way = None if free is None else self._to_first_touch(free)
         if way is not None:
@@ -256,7 +250,7 @@ class Approach:
         every = np.zeros(len(motions.free))
         every[which] = coefficients
         way = motions.displacement(every, linear=full.bulk.linear)
-        self._go(full.state() + np.where(full.constrained, 0.0, way))
+        self._full.evaluate_at(full.state() + np.where(full.constrained, 0.0, way))
 
     def _to_first_touch(self, free: _Free) -> Array | None:
         """The way by which the load leads to first touch; None: it meets nothing. Collective."""

@@ -13,7 +13,6 @@ from collections.abc import Callable
 import numpy as np
 
 from fenics_contact.methods.equations import Equations
-from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.least_motion import find_least_motion
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array
@@ -76,7 +75,7 @@ def _move(equations: Equations, part: Callable[[Array], Array], modes: Array) ->
         if change is None or np.abs(change).max() <= least:
             break
         way = motions.displacement(change, linear=linear)
-        _evaluate_at(full, full.state() + np.where(full.constrained, 0.0, way))
+        full.evaluate_at(full.state() + np.where(full.constrained, 0.0, way))
         moved = True
     if not moved:
         return False
@@ -86,19 +85,12 @@ def _move(equations: Equations, part: Callable[[Array], Array], modes: Array) ->
             multipliers.append((contact.multipliers, contact.multipliers.fields.rows()))
             contact.multipliers.drop(np.all(~points, axis=0))
     equations.residual_at(system.part(full.state()))
-    _evaluate_at(full, full.state())
+    full.evaluate_at(full.state())
     augmented = [contact for contact in full.contacts if contact.multipliers is not None]
     if equations.solved() and all(c.enforcement_error() <= c.tolerance for c in augmented):
         return True
     for each, rows in multipliers:
         each.fields.set_rows(rows)
     equations.residual_at(system.part(solution))
-    _evaluate_at(full, solution)
+    full.evaluate_at(solution)
     return False
-
-
-def _evaluate_at(full: FullSystem, state: Array) -> None:
-    """Make a state the present one, and evaluate the contacts there. Collective."""
-    full.set_state(state)
-    for contact in full.contacts:
-        contact.evaluate()

@@ -46,7 +46,7 @@ def find_ejected_bodies(
 
     Returns:
         By the name of a body its translation in the increment, the limit of it, and the largest
-        displacement nearby, change of its shape, or least motion (length).
+        displacement nearby, change of its shape or of contact springs, or least motion (length).
     """
     scales, n = full.scales, full.scales.n_bodies
     loose = motions.unconstrained_bodies()

@@ -136,6 +136,12 @@ class FullSystem(System):
         self.displacement.follow()
         self.set_motions(state)
 
+    def evaluate_at(self, state: Array) -> None:
+        """Make a state the present one, and evaluate the contacts there. Collective."""
+        self.set_state(state)
+        for contact in self.contacts:
+            contact.evaluate()
+
     def displacement_at(self, state: Array) -> fem.Function:
         """The displacement of a state of this rank's unknowns, a copy. Collective."""
         n = self.unknowns.n_dofs
