@@ -616,9 +616,10 @@ class Pushed:
         law=None,
         angle=0.0,
         enforcement=None,
+        far=None,
         **options,
     ):
-        """Put the block at a place."""
+        """Put the block at a place, and, if it is said how far, another away from all."""
         c, s = np.cos(angle), np.sin(angle)
         self.turn = np.array([[c, -s], [s, c]])
 
@@ -627,7 +628,12 @@ class Pushed:
             return Box(low, size, n=(4, 4), bend=lambda x: (x + low) @ self.turn.T - low)
 
         made = {"pushed": box((place, 0.0), (1.0, 1.0)), "led": box((-1.2, 0.1), (1.0, 0.8))}
+        if far:
+            made["unrelated"] = Box((far, far), n=(2, 2))
         scene = Beside(made, E=1e3, rubber=rubber)
+        if far:
+            for component in range(2):
+                scene.hold("unrelated", LEFT, component)
         self._led = [scene.bodies.constant(0.0) for _ in range(2)]
         self.down = scene.bodies.constant((0.0, 0.0))
         for component, constant in enumerate(self._led):
@@ -671,6 +677,7 @@ class Pushed:
         {"angle": 0.5},
         {"angle": 0.7, "law": fc.Frictionless()},
         {"enforcement": "augmented"},
+        {"far": 1e4},
     ],
     ids=lambda options: ", ".join(options) or "plain",
 )

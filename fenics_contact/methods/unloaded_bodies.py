@@ -47,24 +47,25 @@ def move_unloaded_bodies(equations: Equations, part: Callable[[Array], Array]) -
     change = np.where(full.constrained, full.state() - equations.began, 0.0)
     modes = modes[~motions.move_any(modes, full.scales.largest(change) > 0.0)]
     groups = motions.groups()[np.argmax(np.abs(modes), axis=1)] if len(modes) else np.zeros(0)
-    moved = [_move(equations, part, modes[groups == group]) for group in np.unique(groups)]
+    moved = [_move(equations, part, modes[groups == n], int(n)) for n in np.unique(groups)]
     return any(moved)
 
 
-def _move(equations: Equations, part: Callable[[Array], Array], modes: Array) -> bool:
+def _move(equations: Equations, part: Callable[[Array], Array], modes: Array, group: int) -> bool:
     """Let some modes be as near to where the increment began as gaps permit. Collective.
 
     Args:
         equations: As in `move_unloaded_bodies`.
         part: Likewise.
         modes: Those of a group, in free motions, (n_modes, n_free).
+        group: Which group of coupled parts they move.
 
     Returns:
         Whether the solution is there now.
     """
     full, motions, system = equations.full, equations.motions, equations.system
-    linear, least = full.bulk.linear, ROUND_OFF * full.scales.mesh_size
-    solution, moved = full.state(), False
+    linear, solution, moved = full.bulk.linear, full.state(), False
+    least = ROUND_OFF * full.scales.size_of_groups[group]
     acting = [motions.has_force(n, c, c.values) for n, c in enumerate(full.contacts)]
     # Where a force acts these modes close no gap, but for round-off.
     free = [~normal for normal, _ in acting]

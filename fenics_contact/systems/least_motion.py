@@ -55,12 +55,13 @@ def find_least_motion(
     Returns:
         Change in free motions, (n_free,) (length); None: none leaves no gap negative.
     """
-    comm, least = full.unknowns.comm, NEGLIGIBLE * full.scales.mesh_size
+    comm, scales = full.unknowns.comm, full.scales
     fields, at_points = motions.present(full.operators, linear=full.bulk.linear)
     rows = [np.zeros((0, len(modes) + 1))]
     closed = closed or [np.zeros(len(values.gap)) for values in states]
     points = zip(full.operators, at_points, states, among, closed, strict=True)
-    for operator, jumps, values, mine, less in points:
+    for number, (operator, jumps, values, mine, less) in enumerate(points):
+        size = scales.size_of_groups[scales.group_of_points(number)]
         normal = np.where(np.isfinite(values.normal), values.normal, 0.0)
         closing = np.einsum("mqd,qd->qm", np.tensordot(modes, jumps, axes=1), normal)
         gap = values.gap - less
@@ -68,8 +69,9 @@ def find_least_motion(
         felt &= np.abs(closing).max(axis=1, initial=0.0) > NEGLIGIBLE
         felt &= operator.contact.law.has_normal_stiffness
         # A gap is left, so that round-off is no force; touching points are as near as they are.
-        touches = (gap <= least) & (gap >= -ROUND_OFF * full.scales.mesh_size)
-        rows.append(np.column_stack([closing, np.where(touches, 0.0, gap - least)])[felt])
+        touches = (gap <= NEGLIGIBLE * size) & (gap >= -ROUND_OFF * size)
+        limit = np.where(touches, 0.0, gap - NEGLIGIBLE * size)
+        rows.append(np.column_stack([closing, limit])[felt])
     limits = gather_rows(comm, np.concatenate(rows))
     mass = global_sum(comm, fields @ fields.T)
     turns = motions.free * (motions.turns > 0.0)
