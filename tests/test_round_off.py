@@ -152,3 +152,26 @@ def test_unloaded_contact_forces_leave_their_round_off():
         run_history(scene | alone, MPI.COMM_WORLD, take)
     assert len(forces) == 6
     assert max(forces[3:5]) < 1e-9 * forces[1]
+
+
+@pytest.mark.parametrize("E", [1.0, 1e3, 1e9])
+@pytest.mark.parametrize("kinematics", ["small", "finite"])
+def test_forces_that_are_round_off_supply_no_energy(kinematics, E):
+    """A block is led to and fro on a floor that it touches, pressed by round-off of its place.
+
+    Friction of 1e-14 at one end of an increment, and none at the other, was told of as energy
+    supplied, 100 % of what is exchanged. Reference: there are no forces, to 1e-12 of E.
+    """
+    scene = Beside({"block": Box(n=(4, 4))}, E=E)
+    place = [scene.bodies.constant(0.0) for _ in range(2)]
+    for component, value in enumerate(place):
+        scene.hold("block", TOP, component, value=value)
+    floor = fc.HalfSpace((0, 0), (0, 1))
+    contact = scene.contact("block", BOTTOM, floor, fc.Coulomb(0.3), kinematics=kinematics)
+    problem = scene.problem(contact)
+    for number, along in enumerate(0.1 * np.random.default_rng(0).normal(size=12)):
+        place[0].value, place[1].value = along, -1e-17 if number % 2 else 0.0
+        step = problem.solve()
+        problem.commit()
+        assert step.energy.friction_energy_gain == 0.0
+        assert np.abs(contact.resultants().force).max() < 1e-12 * E

@@ -12,7 +12,6 @@ import numpy as np
 from fenics_contact.contact.contact import Contact
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.reference_scales import ReferenceScales
-from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index
 
 __all__ = ["Energy", "EnergyState"]
@@ -147,9 +146,13 @@ class EnergyState:
                 add(3, contact.measure * contact.values.dissipated, groups)
                 # Tractions before are those of the commit, not multipliers in their place.
                 slip, normal = contact.slip_vector(), contact.values.normal
-                weight, length = 0.5 * contact.measure, np.sqrt(_dot(slip, slip))
                 first = contact.values.carried_traction if contact.finite else there[0]
-                for traction in (first, here[0]):
+                ends = np.stack([first, here[0]])
+                sizes = contact.measure * np.linalg.norm(ends, axis=2).max(axis=0)
+                # Forces that are round-off may have any direction.
+                acts = sizes > scales.round_off_at_points(number, sizes)
+                weight, length = 0.5 * contact.measure * acts, np.sqrt(_dot(slip, slip))
+                for traction in ends:
                     side = traction - _dot(traction, normal)[:, None] * normal
                     add(5, weight * _dot(side, slip), groups)
                     add(6, weight * (np.sqrt(_dot(side, side)) * length), groups)
@@ -160,9 +163,7 @@ class EnergyState:
             float, sums.sum(axis=1)
         )
         exchanged = np.maximum(np.abs(sums[:3]).sum(axis=0), sums[6])
-        # Where no load is left forces and displacements are round-off.
-        nothing = ROUND_OFF * scales.size_of_groups * scales.round_off_of_groups
-        gives = (sums[5] > 0) & (exchanged > nothing)
+        gives = sums[5] > 0
         return Energy(
             work=work,
             elastic=elastic,
