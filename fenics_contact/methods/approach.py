@@ -167,10 +167,12 @@ class Approach:
         """
         gram: Array = np.zeros((len(which), len(which)))
         work: Array = np.zeros(len(which))
-        for contact, jumps, motion in zip(
-            self._full.contacts, self._felt(which)[1], obstacles, strict=True
+        scales = self._full.scales
+        for number, (contact, jumps, motion) in enumerate(
+            zip(self._full.contacts, self._felt(which)[1], obstacles, strict=True)
         ):
-            touches = contact.values.opening <= FLAT * self._full.scales.mesh_size
+            size = scales.size_of_groups[scales.group_of_points(number)]
+            touches = contact.values.opening <= FLAT * size
             weights = np.where(contact.paired & touches, contact.measure, 0.0)
             way = motion.of_points(contact.own_displacement())
             gram += np.einsum("mqd,q,nqd->mn", jumps, weights, jumps)

@@ -286,13 +286,16 @@ class Starts:
             where they were found.
         """
         equations, tractions, moved = self._equations, [], False
-        comm = equations.full.unknowns.comm
+        comm, scales = equations.full.unknowns.comm, equations.full.scales
         if not self._borne:
             return None
-        for contact, borne in zip(equations.contacts, self._borne, strict=True):
+        for number, (contact, borne) in enumerate(
+            zip(equations.contacts, self._borne, strict=True)
+        ):
             opposite, traction = contact.opposite, borne.values.total_traction
-            change = np.abs(opposite.present_jump() - borne.displacement)
-            if global_max(comm, change) > NEGLIGIBLE * equations.length:
+            change = np.linalg.norm(opposite.present_jump() - borne.displacement, axis=1)
+            size = scales.size_of_groups[scales.group_of_points(number)]
+            if global_max(comm, change / size) > NEGLIGIBLE:
                 return None
             if opposite.carries:
                 way, turned = opposite.carried(borne.values, traction)
