@@ -96,6 +96,25 @@ def test_a_block_that_is_let_go_stays(gap, side, along, bulk, kinematics):
     assert again <= 20
 
 
+@pytest.mark.parametrize(
+    ("bulk", "kinematics"), [("linear", "small"), ("linear", "finite"), ("rubber", "finite")]
+)
+@pytest.mark.parametrize("way", [(0.3, -0.05), (0.3, 0.1), (-0.3, -0.3)])
+def test_a_floor_takes_along_the_block_that_is_let_go(way, bulk, kinematics):
+    """While its load goes, in one increment: it sticks to the floor as long as any load is left.
+
+    Reference: the way of the floor, to the strain. With small displacements the block was left
+    behind, or the increment refused.
+    """
+    scene = Free("quadrilateral", bulk, kinematics=kinematics)
+    scene.go(3.0, 20.0)
+    scene.traction.value[:], scene.shift.value[:] = 0.0, way
+    step = scene.problem.solve()
+    ways = gathered(COMM, scene.contact.own_displacement())
+    assert np.abs(ways - way).max() < 0.02
+    assert step.iterations <= 5
+
+
 @pytest.mark.parametrize("size", [1.0, 1e-4])
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron", "hexahedron"])
 def test_rubber_that_is_let_go_stays_in_any_units(cell, size):

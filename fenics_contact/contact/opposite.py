@@ -148,7 +148,6 @@ class Opposite(ABC):
         is_finite: Whether displacements may be of any size.
         is_rigid: Whether it is a rigid obstacle, whose reactions are external to the mesh.
         follows: Whether the pairs follow the bodies wherever they go.
-        carries: Whether it is an obstacle that takes along what sticks to it by any amount.
         pairs_anew: Whether pairs are found anew, on the deformed bodies, at every commit and in
             increments in which bodies slide.
         degenerate: Whether Γc has lost its tangent plane somewhere, where pairs follow the bodies.
@@ -161,7 +160,6 @@ class Opposite(ABC):
     is_finite = False
     is_rigid = True
     follows = False
-    carries = False
     sampler: ObstacleSampler | None = None
 
     def __init__(
@@ -433,7 +431,7 @@ class Opposite(ABC):
             (length), and the traction, turned with it.
 
         Raises:
-            ValueError: It does not; see `carries`.
+            ValueError: Bodies do not move but as ``u`` does.
         """
         raise ValueError(f"{self._parts.name}: the obstacle has no displacement")
 

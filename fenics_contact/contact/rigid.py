@@ -72,6 +72,11 @@ class RigidOpposite(Opposite):
         """See `Opposite`."""
         return self._parts.obstacle.is_flat and self._varying is None
 
+    def carried(self, values: PointValues, traction: Array) -> tuple[Array, Array]:
+        """See `Opposite`."""
+        self.update()
+        return self.data.values["shift"] - values.shift, traction
+
     def gradient_error(self, values: PointValues) -> Array:
         """See `Opposite`."""
         if self.sampler is not None:
@@ -100,7 +105,6 @@ class MovingOpposite(Opposite):
     """A rigid obstacle that may move and turn by any amount, seen from where Γc is now."""
 
     is_finite = True
-    carries = True
 
     def __init__(self, parts: Parts) -> None:
         """Place it, and see it from moving points. Collective.

@@ -91,7 +91,7 @@ class Starts:
         """Take note of what contacts bear, in the solution or where it has moved. Collective."""
         self._borne = []
         contacts = self._equations.contacts
-        if not any(c.opposite.carries for c in contacts):
+        if not any(contact.rigid for contact in contacts):
             return
         for contact in contacts:
             contact.evaluate()
@@ -297,7 +297,7 @@ class Starts:
             size = scales.size_of_groups[scales.group_of_points(number)]
             if global_max(comm, change / size) > NEGLIGIBLE:
                 return None
-            if opposite.carries:
+            if contact.rigid:
                 way, turned = opposite.carried(borne.values, traction)
                 moved = moved or global_max(comm, np.abs(way)) > 0.0
                 traction = turned - np.einsum("qij,qj->qi", borne.tangent.by_jump, way)
