@@ -363,23 +363,28 @@ class Approach:
         # What was let go, obstacles may have moved into: it goes out, or no deeper where it cannot.
         for deep in (gaps, np.maximum(gaps, NEGLIGIBLE)):
             limit = np.concatenate([deep, ends])
-            found = agreed(comm, _maximise(work, matrix, limit))
+            found = _maximise(work, matrix, limit)
             if found is not None or gaps.min() >= 0:
                 break
         if found is None:
             return None
-        # A body without load, which others may push, is free to go anywhere that gaps permit: it
-        # moves least. It gives back no more than a tenth of what bodies are set down deeper than to
-        # touch.
-        least_work = (1.0 - 0.1 * NEGLIGIBLE) * float(work @ found)
-        matrix, limit = np.vstack([matrix, -work]), np.append(limit, [-least_work])
+        # Many motions may do the same work: what no load leads anywhere, though gaps would let it
+        # go, moves least. All of them leave those limits where they are that bear the load, here to
+        # a tenth of what bodies are set down deeper than to touch.
+        place, bearing = agreed(comm, found[0]), agreed(comm, found[1]) > 0.0
+        least_limit = np.concatenate([limit, 0.1 * NEGLIGIBLE - limit[bearing]])
         mass = ways.T @ free.mass @ ways
-        least = agreed(comm, minimise_norm(mass, np.zeros(len(work)), matrix, limit))
-        return far * (ways @ (found if least is None else least))
+        rows = np.concatenate([matrix, -matrix[bearing]])
+        least = agreed(comm, minimise_norm(mass, np.zeros(len(work)), rows, least_limit))
+        return far * (ways @ (place if least is None else least))
 
 
-def _maximise(work: Array, matrix: Array, limit: Array) -> Array | None:
-    """Maximise work @ x where matrix @ x <= limit; None: there is no such x, or no most."""
+def _maximise(work: Array, matrix: Array, limit: Array) -> tuple[Array, Array] | None:
+    """Maximise work @ x where matrix @ x <= limit.
+
+    Returns:
+        That x, and the multipliers of the rows; None: there is no such x, or no most.
+    """
     found = scipy.optimize.linprog(
         -work,
         A_ub=matrix,
@@ -387,4 +392,4 @@ def _maximise(work: Array, matrix: Array, limit: Array) -> Array | None:
         bounds=(None, None),
         options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
     )
-    return found.x if found.status == 0 else None
+    return (found.x, -found.ineqlin.marginals) if found.status == 0 else None
