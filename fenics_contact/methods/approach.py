@@ -372,10 +372,10 @@ class Approach:
         # go, moves least. All of them leave those limits where they are that bear the load, here to
         # a tenth of what bodies are set down deeper than to touch.
         place, bearing = agreed(comm, found[0]), agreed(comm, found[1]) > 0.0
-        least_limit = np.concatenate([limit, 0.1 * NEGLIGIBLE - limit[bearing]])
+        both = np.concatenate([matrix, -matrix[bearing]])
+        limit = np.concatenate([limit, 0.1 * NEGLIGIBLE - limit[bearing]])
         mass = ways.T @ free.mass @ ways
-        rows = np.concatenate([matrix, -matrix[bearing]])
-        least = agreed(comm, minimise_norm(mass, np.zeros(len(work)), rows, least_limit))
+        least = agreed(comm, minimise_norm(mass, np.zeros(len(work)), both, limit))
         return far * (ways @ (place if least is None else least))
 
 
