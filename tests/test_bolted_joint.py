@@ -46,8 +46,8 @@ def test_tightened_and_pulled_until_it_slips() -> None:
 
     raised_everywhere(solve, fc.NotConverged, words)
     # Twice, between predicted opposite points and between committed ones; each time the first
-    # method that solves for loads alone tells of it, in 11 iterations. How long L-BFGS goes on
-    # before, by round-off, is a multiple of the 20 iterations in which it has to gain.
+    # method that is tried after L-BFGS tells of it, in 11 iterations. How many rounds of 20
+    # iterations L-BFGS makes before is decided by round-off.
     tried = failed[0].attempts
     assert [each.method for each in tried] == ["lbfgs", "alternating"] * 2
     assert all(each.iterations < 20 for each in tried[1::2])

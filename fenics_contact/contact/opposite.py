@@ -431,7 +431,7 @@ class Opposite(ABC):
             (length), and the traction, turned with it.
 
         Raises:
-            ValueError: Bodies do not move but as ``u`` does.
+            ValueError: The opposite is a body.
         """
         raise ValueError(f"{self._parts.name}: the obstacle has no displacement")
 

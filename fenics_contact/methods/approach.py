@@ -171,8 +171,7 @@ class Approach:
         for number, (contact, jumps, motion) in enumerate(
             zip(self._full.contacts, self._felt(which)[1], obstacles, strict=True)
         ):
-            size = scales.size_of_groups[scales.group_of_points(number)]
-            touches = contact.values.opening <= FLAT * size
+            touches = contact.values.opening <= FLAT * scales.size_at_points(number)
             weights = np.where(contact.paired & touches, contact.measure, 0.0)
             way = motion.of_points(contact.own_displacement())
             gram += np.einsum("mqd,q,nqd->mn", jumps, weights, jumps)
@@ -363,7 +362,7 @@ class Approach:
         # What was let go, obstacles may have moved into: it goes out, or no deeper where it cannot.
         for deep in (gaps, np.maximum(gaps, NEGLIGIBLE)):
             limit = np.concatenate([deep, ends])
-            found = _maximise(work, matrix, limit)
+            found = agreed(comm, _maximise(work, matrix, limit))
             if found is not None or gaps.min() >= 0:
                 break
         if found is None:
@@ -371,7 +370,7 @@ class Approach:
         # Many motions may do the same work: what no load leads anywhere, though gaps would let it
         # go, moves least. All of them leave those limits where they are that bear the load, here to
         # a tenth of what bodies are set down deeper than to touch.
-        place, bearing = agreed(comm, found[0]), agreed(comm, found[1]) > 0.0
+        place, bearing = found[0], found[1] > 0.0
         both = np.concatenate([matrix, -matrix[bearing]])
         limit = np.concatenate([limit, 0.1 * NEGLIGIBLE - limit[bearing]])
         mass = ways.T @ free.mass @ ways

@@ -294,8 +294,7 @@ class Starts:
         ):
             opposite, traction = contact.opposite, borne.values.total_traction
             change = np.linalg.norm(opposite.present_jump() - borne.displacement, axis=1)
-            size = scales.size_of_groups[scales.group_of_points(number)]
-            if global_max(comm, change / size) > NEGLIGIBLE:
+            if global_max(comm, change / scales.size_at_points(number)) > NEGLIGIBLE:
                 return None
             if contact.rigid:
                 way, turned = opposite.carried(borne.values, traction)

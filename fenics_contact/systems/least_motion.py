@@ -61,7 +61,7 @@ def find_least_motion(
     closed = closed or [np.zeros(len(values.gap)) for values in states]
     points = zip(full.operators, at_points, states, among, closed, strict=True)
     for number, (operator, jumps, values, mine, less) in enumerate(points):
-        size = scales.size_of_groups[scales.group_of_points(number)]
+        size = scales.size_at_points(number)
         normal = np.where(np.isfinite(values.normal), values.normal, 0.0)
         closing = np.einsum("mqd,qd->qm", np.tensordot(modes, jumps, axes=1), normal)
         gap = values.gap - less

@@ -209,6 +209,10 @@ class ReferenceScales:
         np.maximum.at(found, self.group[: self.n_bodies], self.size)
         return found
 
+    def size_at_points(self, number: int) -> Array:
+        """`size_of_groups` at this rank's points of a contact, by its number, (n_points,)."""
+        return np.asarray(self.size_of_groups[self.group_of_points(number)])
+
     @property
     def n_groups(self) -> int:
         """Number of groups of coupled parts."""
