@@ -15,8 +15,8 @@ from fenics_contact import checkpoint
 from fenics_contact.elasticity import LinearElastic
 from fenics_contact.parallel import global_sum
 from scenes import problems, two_blocks
-from scenes.blocks import GRID, TOP, block, bulge, wave
-from scenes.comparing import at_points, close, gathered, shared_folder
+from scenes.blocks import FRONT, GRID, LEFT, TOP, block, bulge, wave
+from scenes.comparing import at_points, close, gathered, nodal, shared_folder
 
 COMM = MPI.COMM_WORLD
 E = 1000.0
@@ -190,7 +190,6 @@ def test_rule_by_default(degree: int) -> None:
 
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.two_ranks
-@pytest.mark.two_ranks
 def test_stick_is_stick(degree: int) -> None:
     """Sheared to and fro below the limit, a block stays where it is, however often.
 
@@ -290,7 +289,6 @@ def test_force_and_tangent_with_multipliers(law: str) -> None:
 @pytest.mark.mpi
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.two_ranks
-@pytest.mark.two_ranks
 def test_soft_springs(degree: int) -> None:
     """Springs of 0.01 E/h, pressed, sheared until points slip, and reversed: as those of 10 E/h.
 
@@ -315,6 +313,53 @@ def test_soft_springs(degree: int) -> None:
             forces.append(contact.resultants().force)
         assert contact.resultants().slip > 0
     assert close(np.array(forces[:3]), np.array(forces[3:]), 1e-4 if degree == 1 else 2e-3)
+
+
+@pytest.mark.two_ranks
+@pytest.mark.parametrize(
+    ("cell", "n", "frictions", "load", "modulus", "gap"),
+    [
+        ("hexahedron", 2, (0.6, 0.0), (5.62, 10.6), 1e5, 0.0),
+        ("hexahedron", 3, (0.3, 0.3), (0.75, 5.48), 1e3, 1e-3),
+        ("tetrahedron", 2, (0.6, 0.3), (4.83, 9.78), 1e5, 1e-2),
+        ("tetrahedron", 3, (0.6, 0.3), (2.76, 2.45), 1e3, 1e-2),
+    ],
+)
+def test_a_block_in_a_corner(
+    cell: str,
+    n: int,
+    frictions: tuple[float, float],
+    load: tuple[float, float],
+    modulus: float,
+    gap: float,
+) -> None:
+    """A block on a floor with friction, pressed against a wall, by loads that rise and fall.
+
+    What the wall bears at the edge that both share changes what the floor bears there: accelerated
+    each by itself, the augmentations of all four fail. Both bear the loads, by statics. The
+    displacements are those of the penalty at 1e4 E/h to 2 % of the largest, for cells of a half to
+    a third of the block: which of both holds their common edge is not unique.
+    """
+    displacements = []
+    for given in (AUGMENTED, {}):
+        scene = block(cell, 1, n=n, E=modulus)
+        springs = {} if given else dict.fromkeys(("k_n", "k_t"), fc.RelativeStiffness(1e4))
+        laws = [fc.Coulomb(mu, **springs) for mu in frictions]
+        floor = scene.contact(laws[0], **given)
+        obstacle = fc.HalfSpace((-gap, 0.0, 0.0), (1.0, 0.0, 0.0))
+        surface = fc.ContactSurface(scene.mesh, scene.tags, LEFT)
+        wall = fc.Contact(scene.u, surface, obstacle, laws[1], name="wall", **given)
+        held = [scene.hold(FRONT, 1)]
+        problem = fc.ContactProblem(scene.F, scene.u, bcs=held, contacts=[floor, wall])
+        for share in (1 / 3, 2 / 3, 1.0, 0.8, 0.6, 0.4, 0.2):
+            side, up = (-share * part for part in load)
+            scene.load(side=side, up=up)
+            problem.solve()
+            problem.commit()
+            force = sum(contact.resultants().force for contact in (floor, wall))
+            assert close(force[[0, 2]], [-side, -up], 1e-8)
+        displacements.append(nodal(scene.u))
+    assert close(*displacements, 0.02)
 
 
 def test_by_hand() -> None:

@@ -499,7 +499,7 @@ class Contact(PointResults):
         multipliers = self._augmented()
         self.evaluate()
         error = multipliers.error(self.values, self.history, self.moved())
-        multipliers.update(self.values)
+        multipliers.take(multipliers.augmented(self.values)[1], self.values)
         self.states.forget()
         return error
 

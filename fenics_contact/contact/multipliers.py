@@ -5,8 +5,8 @@ starts from λ_t in place of the committed traction. Where λ_n = -r_n and λ_t 
 and nothing creeps before it slips, however soft the springs are. After every solution the
 multipliers are taken from the tractions found, and the next one starts from there (Uzawa): each
 round leaves a share of about 1/(1 + k_n/k) of the penetration, k the stiffness of the body against
-it. Where springs are soft that is nearly all of it, so a round goes on to the combination of the
-last ones that leaves least (Anderson acceleration, doi:10.1137/10078356X).
+it. Where springs are soft that is nearly all of it, so rounds are accelerated
+(`methods/acceleration.py`).
 
 There are more points on Γc than displacements can answer: 3 to an edge of quadratic cells, which
 has 2 nodes of its own. Multipliers of every point would pile up what nothing answers, and those
@@ -27,7 +27,7 @@ from mpi4py import MPI
 
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law
-from fenics_contact.parallel import global_max, global_sum
+from fenics_contact.parallel import global_max
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.mass import mass_solver
@@ -40,9 +40,6 @@ __all__ = ["Multipliers", "TraceProjection"]
 
 # Round-off of a displacement, by its size.
 _BLUR = 100 * np.finfo(float).eps
-# How many rounds before the last are combined with it, and how well their rests are to be told
-# apart, relative and squared.
-_DEPTH, _DISTINCT = 6, 1e-12
 # Where tractions have grown by more than the first factor since the rounds began, the springs must
 # bear less than this share of what they did then: else multipliers grow by the same in every round,
 # and what is left is small beside them alone.
@@ -92,56 +89,6 @@ class TraceProjection:
         return result.reshape(values.shape)
 
 
-class _Acceleration:
-    """Anderson's, of a sequence in which each array is made from the one before, on a part of Γc.
-
-    The next is the combination of those made, the coefficients adding up to 1, whose rests (what a
-    round changes) combined that way are least in the mean square over Γc. A rest that is larger
-    than the one before, as where points have changed their status, begins a new sequence.
-    """
-
-    def __init__(self, comm: MPI.Comm, weights: Array) -> None:
-        self._comm, self._weights = comm, weights
-        self._last: tuple[Array, Array] | None = None
-        self._size = np.inf
-        self._steps: list[tuple[Array, Array]] = []
-
-    def begin(self) -> None:
-        """Drop all rounds."""
-        self._last, self._size, self._steps = None, np.inf, []
-
-    def __call__(self, given: Array, made: Array) -> Array:
-        """The next of the sequence. Collective.
-
-        Args:
-            given: What the round began with, (n_points, n).
-            made: What came of it, the same shape.
-
-        Returns:
-            It, the same shape.
-        """
-        rest = made - given
-        size = float(self._product(rest, rest))
-        if self._last is None or size > self._size:
-            self.begin()
-        else:
-            self._steps.append((rest - self._last[0], made - self._last[1]))
-            self._steps = self._steps[-_DEPTH:]
-        self._last, self._size = (rest, made), size
-        if not self._steps:
-            return made
-        changes = [change for change, _ in self._steps]
-        gram = np.array([[self._product(a, b) for b in changes] for a in changes])
-        right = np.array([self._product(a, rest) for a in changes])
-        long = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
-        share = np.linalg.lstsq(gram / np.outer(long, long), right / long, rcond=_DISTINCT)[0]
-        steps = [way for _, way in self._steps]
-        return made - sum(c * way for c, way in zip(share / long, steps, strict=True))
-
-    def _product(self, a: Array, b: Array) -> Array:
-        return global_sum(self._comm, self._weights @ np.sum(a * b, axis=1))
-
-
 class Multipliers:
     """λ_n and λ_t at the points of a contact.
 
@@ -172,10 +119,6 @@ class Multipliers:
         self._project = TraceProjection(quadrature, degree)
         # By connected part of Γc: one of them may bear a millionth of another.
         self._patch, self._n_patches = _patches(quadrature)
-        self._accelerated = [
-            _Acceleration(self._comm, np.where(self._patch == i, quadrature.weights, 0.0))
-            for i in range(self._n_patches)
-        ]
         # Of every part, change and tractions of the first round; NaN: there was none yet.
         self._first: Array = np.full((2, self._n_patches), np.nan)
         self._left_out: Array | None = None  # of the next change of λ_t
@@ -268,16 +211,37 @@ class Multipliers:
         bears = self._largest(np.where(idle, 0.0, 1.0))[self._patch] > 0.0
         self.fields.set_rows(np.where(bears[:, None], self.fields.rows(), 0.0))
 
-    def update(self, values: PointValues) -> None:
-        """Make the tractions of an evaluated contact the multipliers, and go on. Collective."""
+    def augmented(self, values: PointValues) -> Array:
+        """The multipliers, and those that the tractions of an evaluated contact make. Collective.
+
+        Returns:
+            Array (2, n_points, 1 or 1 + gdim) (stress): λ_n and, with friction, λ_t.
+        """
         found = self._next(values)
-        given = np.column_stack([self.fields.values(name) for name in found])
-        rows = made = np.column_stack(list(found.values()))
-        for i, accelerated in enumerate(self._accelerated):
-            rows = np.where((self._patch == i)[:, None], accelerated(given, made), rows)
+        given = [self.fields.values(name) for name in found]
+        return np.stack([np.column_stack(given), np.column_stack(list(found.values()))])
+
+    def take(self, rows: Array, values: PointValues) -> None:
+        """Go on with other multipliers at an evaluated contact. Collective.
+
+        Args:
+            rows: λ_n and, with friction, λ_t, (n_points, 1 + gdim) (stress).
+            values: Of the contact.
+        """
         self.fields.assign(
             {"pressure": rows[:, 0], "traction": rows[:, 1:], "normal": values.framed_normal}
         )
+
+    def sizes(self, rows: Array) -> Array:
+        """Largest absolute values on each connected part of Γc, at its points. Collective.
+
+        Args:
+            rows: (n_points, n).
+
+        Returns:
+            Array (n_points,).
+        """
+        return self._largest(rows)[self._patch]
 
     def committed(self, values: PointValues) -> dict[str, Array]:
         """What of the state of an evaluated contact becomes history, by name.
@@ -299,8 +263,6 @@ class Multipliers:
 
     def restore(self, history: PointFields) -> None:
         """Take those of the last commit. Collective."""
-        for accelerated in self._accelerated:
-            accelerated.begin()
         self._first[:] = np.nan
         self._left_out = None
         values = {"pressure": history.values("multiplier")}

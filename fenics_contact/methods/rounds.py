@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from fenics_contact.methods.acceleration import Acceleration
 from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.method import OVERLOADED
@@ -56,6 +57,7 @@ def solve_in_rounds(
     _shrink(equations, load_before)
     attempts: list[Attempt] = []
     exact = False
+    acceleration = Acceleration(equations.full.contacts, equations.full.scales)
     # The first solutions need not be better than the multipliers they are found with.
     equations.round_rtol = _FIRST_ROUND
     try:
@@ -89,8 +91,7 @@ def solve_in_rounds(
             left = min((e for e in errors if e > 0), default=0.0)
             equations.round_rtol = 0.0 if exact else min(_FIRST_ROUND, INNER * left)
             if number < _MAX_ROUNDS and worst > share:
-                for contact in augmented:
-                    contact.augment()
+                acceleration.augment()
                 if overloaded:  # what the load moved may be too far away to come back
                     equations.system.set_state(start)
     finally:
