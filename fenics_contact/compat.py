@@ -17,7 +17,6 @@ from fenics_contact.types import Array
 __all__ = [
     "LONGEST_STEP",
     "NOT_FINITE",
-    "adjacency",
     "cell_partitioner",
     "collapsed",
     "contains",
@@ -93,12 +92,6 @@ def option_was_read(name: str) -> bool:
     library = ctypes.CDLL(PETSc.__file__)
     library.PetscOptionsUsed(None, name.encode(), ctypes.byref(read))
     return bool(read.value)
-
-
-def adjacency(values: npt.NDArray[Any], offsets: npt.NDArray[np.int32]) -> Any:
-    """Lists of numbers one behind another, as a partitioner has to return them."""
-    lists = dolfinx.graph.adjacencylist(values, offsets)
-    return getattr(lists, "_cpp_object", lists)
 
 
 def cell_partitioner(ghost_mode: dolfinx.mesh.GhostMode) -> Any:

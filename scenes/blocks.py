@@ -18,7 +18,7 @@ import fenics_contact as fc
 from fenics_contact import compat
 from fenics_contact.types import Array
 from scenes.elasticity import displacement_space, hold, strain, stress
-from scenes.meshes import mesh_of
+from scenes.meshes import mesh_of, one_rank_each
 from scenes.tags import sides
 
 CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
@@ -85,9 +85,7 @@ def layers(cell: str) -> Callable:
 
     def partition(comm: MPI.Comm, n_parts: int, cell_types: Any, cells: Any) -> Any:
         n_cells = cells[0].size // n_vertices
-        destination = (np.arange(n_cells) * n_parts // max(n_cells, 1)).astype(np.int32)
-        offsets = np.arange(n_cells + 1, dtype=np.int32)
-        return compat.adjacency(destination, offsets)
+        return one_rank_each(np.arange(n_cells) * n_parts // max(n_cells, 1))
 
     return partition
 

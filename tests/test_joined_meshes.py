@@ -17,10 +17,9 @@ from dolfinx.mesh import CellType, GhostMode
 from mpi4py import MPI
 
 import fenics_contact as fc
-from fenics_contact import compat
 from scenes.blocks import BOTTOM, CELLS, LEFT, TOP, block_mesh, dimension
 from scenes.comparing import raised_everywhere
-from scenes.meshes import mesh_of
+from scenes.meshes import mesh_of, one_rank_each
 
 COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.hexahedra, pytest.mark.three_ranks, pytest.mark.timeout(120)]
@@ -191,9 +190,7 @@ def test_a_body_on_one_rank_alone() -> None:
     """Cells are distributed anew, wherever they were; ranks without any are nothing special."""
 
     def on_the_last(comm: MPI.Comm, n: int, types: Any, cells: Any) -> Any:
-        count = cells[0].size // 4
-        owner = np.full(count, n - 1, dtype=np.int32)
-        return compat.adjacency(owner, np.arange(count + 1, dtype=np.int32))
+        return one_rank_each(np.full(cells[0].size // 4, n - 1))
 
     mesh, sides = block_mesh("quadrilateral", n=6, partitioner=on_the_last)
     joined = fc.join_meshes({"a": (mesh, None, sides), "b": (mesh, None, sides)})

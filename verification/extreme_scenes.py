@@ -23,9 +23,9 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from fenics_contact import compat
 from fenics_contact.types import Array
 from scenes.bodies import Bodies, boxes, graded
+from scenes.meshes import one_rank_each
 from scenes.processes import command, environment
 from scenes.tags import near
 
@@ -547,9 +547,7 @@ def lower_block_apart(comm: MPI.Comm, n_parts: int, cell_types: Any, cells: Any)
     n_cells = cells[0].size // 4
     n_lower = 6 * 3
     upper = np.arange(max(n_cells - n_lower, 0)) * (n_parts - 1) // max(n_cells - n_lower, 1)
-    destination = np.concatenate([np.full(min(n_lower, n_cells), n_parts - 1), upper])
-    offsets = np.arange(n_cells + 1, dtype=np.int32)
-    return compat.adjacency(destination.astype(np.int32), offsets)
+    return one_rank_each(np.concatenate([np.full(min(n_lower, n_cells), n_parts - 1), upper]))
 
 
 def ranked(

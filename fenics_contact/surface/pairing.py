@@ -73,8 +73,6 @@ class Pairing:
     """The surface opposite Γc, ready to be paired with the points of Γc.
 
     Attributes:
-        facets: This rank's facets of it.
-        surface: Γc.
         rays: Both surfaces, and what rays from one meet of the other.
         round_off: Distances no larger than this are differences of coordinates and nothing else.
     """
@@ -94,7 +92,6 @@ class Pairing:
         self.rays = rays = Rays(obstacle, quadrature, space)
         self._here, self._there = rays.here.facets, rays.there.facets
         self._sides, self._facet, self._space = (rays.here, rays.there), rays.facet, space
-        self.facets, self.surface = rays.facets, quadrature.surface
         self._place: Array | None = None
         self._present: PresentHits | None = None
         self._faceting: dict[int, Array] = {}

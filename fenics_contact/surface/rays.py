@@ -220,7 +220,6 @@ class Rays:
     Attributes:
         here: Γc, `Side`.
         there: The opposite surface.
-        facets: This rank's facets of it.
         body: Connected part of every node of this rank.
         facet: Facet of Γc of every owned point, among those of this rank, (n_points,).
     """
@@ -236,10 +235,10 @@ class Rays:
         mesh = space.mesh
         self._comm, self._d, self._space = mesh.comm, mesh.topology.dim, space
         self._obstacle = obstacle
-        self.facets = tagged_facets(mesh, obstacle.facet_tags, obstacle.tags)
+        opposite = tagged_facets(mesh, obstacle.facet_tags, obstacle.tags)
         _, self.body = connected_bodies(space)
         self.here = Side(FacetSet(space, quadrature.surface.facets), self.body)
-        self.there = Side(FacetSet(space, self.facets), self.body)
+        self.there = Side(FacetSet(space, opposite), self.body)
         # The points of a facet are the dofs of a submesh cell.
         rows = quadrature.point_rows()
         self.facet = np.empty(quadrature.n_points, dtype=np.int64)
