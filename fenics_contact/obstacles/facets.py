@@ -6,13 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from fenics_contact.obstacles.base import Sample
-from fenics_contact.obstacles.refinement import refined
+from fenics_contact.obstacles.refinement import refined, weighted_normals
 from fenics_contact.obstacles.search import FacetSearch
-from fenics_contact.types import Array, Mask
+from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Facets"]
-
-Numbers = npt.NDArray[np.intp]
 
 # Of the size of the surface: distance from an edge within which the direction to it is round-off;
 # and difference of two distances that are the same, within which a place is at an edge or corner.
@@ -40,14 +38,12 @@ class Facets:
         size: Its largest extent, or coordinate (length).
     """
 
-    def __init__(
-        self, points: Array, facets: Numbers, halvings: int = 0, sharp: float = 0.0
-    ) -> None:
+    def __init__(self, points: Array, facets: Index, halvings: int = 0, sharp: float = 0.0) -> None:
         """Make normals and search.
 
         Args:
             points: Corners, (n, d); equal ones are one.
-            facets: Numbers of the corners, (m, d).
+            facets: Index of the corners, (m, d).
             halvings: How often triangles are `refined` towards a smooth surface.
             sharp: Angle of edges that it keeps (radians).
 
@@ -82,7 +78,6 @@ class Facets:
             (n_facets, n_features, d) and (n_facets, n_features); feature 0 is the facet.
         """
         m, d = self.facets.shape
-        spans = np.roll(corners, -1, axis=1) - corners
         at_corners = np.zeros_like(self.points)
         borders = np.zeros((m, 1 if d == 2 else 4), dtype=np.bool_)
         whole = normals[:, None, :]
@@ -94,11 +89,9 @@ class Facets:
             _check_order(begins, ends, self.points)
             at_border = begins != ends
         else:
+            weighted = weighted_normals(corners, normals)
             for k in range(3):
-                one, other = spans[:, k], -spans[:, k - 1]
-                across = np.linalg.norm(np.cross(one, other), axis=1)
-                angle = np.arctan2(across, np.einsum("ij,ij->i", one, other))
-                np.add.at(at_corners, self.facets[:, k], angle[:, None] * normals)
+                np.add.at(at_corners, self.facets[:, k], weighted[:, k])
             beyond = _beyond(self.facets, self.points)
             neighbour = np.where(beyond < 0, -1, beyond // 3)
             beside = np.where((neighbour >= 0)[:, :, None], normals[neighbour], 0.0)
@@ -142,10 +135,10 @@ class Facets:
         curvature = np.where(far[:, None, None], across / radius[:, None, None], 0.0)
         return Sample(distance + rest, -slope, curvature)
 
-    def _distance(self, x: Array, facet: Numbers) -> Array:
+    def _distance(self, x: Array, facet: Index) -> Array:
         return np.linalg.norm(x - self._foot(x, facet)[0], axis=1)
 
-    def _foot(self, x: Array, facet: Numbers) -> tuple[Array, Numbers]:
+    def _foot(self, x: Array, facet: Index) -> tuple[Array, Index]:
         """The closest point of one facet for each point, and the part of the facet it is on."""
         corners, spans = self._corners[facet], self._spans[facet]
         d = x.shape[1]
@@ -179,7 +172,7 @@ class Facets:
         return foot, np.where(inside, 0, feature)
 
 
-def _welded(points: Array, facets: Numbers) -> tuple[Array, Numbers]:
+def _welded(points: Array, facets: Index) -> tuple[Array, Index]:
     """Distinct corners, and the facets that have as many of them."""
     distinct, number = np.unique(points, axis=0, return_inverse=True)
     facets = number.reshape(-1)[facets]
@@ -201,7 +194,7 @@ def _facet_normals(corners: Array) -> tuple[Array, Mask]:
     return normals / length[:, None], has
 
 
-def _beyond(facets: Numbers, points: Array) -> Numbers:
+def _beyond(facets: Index, points: Array) -> Index:
     """Of every edge of triangles the number of its other side, -1 where there is none: (n, 3)."""
     start, end, n_points = facets, np.roll(facets, -1, axis=1), len(points)
     forward = (start * n_points + end).ravel()

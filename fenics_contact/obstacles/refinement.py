@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from fenics_contact.types import Array, Mask
+from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["refined"]
-
-Numbers = npt.NDArray[np.intp]
+__all__ = ["refined", "weighted_normals"]
 
 # Corners of the four triangles that one is halved to, among its own (0, 1, 2) and the middles of
 # its edges (3, 4, 5); and their edges, two halves of each of its own, and 6 within it.
@@ -21,7 +18,7 @@ _EDGES = ((0, 6, 5), (1, 2, 6), (6, 3, 4), (6, 6, 6))
 _BLADE = 0.01
 
 
-def refined(corners: Array, normals: Array, beyond: Numbers, times: int, sharp: float) -> Array:
+def refined(corners: Array, normals: Array, beyond: Index, times: int, sharp: float) -> Array:
     """Triangles whose edges are halved, new corners where a smooth surface has them.
 
     The middle of an edge lies on the cubic that its ends and the normals there give, that of the
@@ -66,6 +63,17 @@ def refined(corners: Array, normals: Array, beyond: Numbers, times: int, sharp: 
     return corners
 
 
+def weighted_normals(corners: Array, normals: Array) -> Array:
+    """Normals of triangles, (m, 3), times the angle at each of their corners, (m, 3, 3)."""
+    spans = np.roll(corners, -1, axis=1) - corners
+    weighted = np.empty_like(corners)
+    for k in range(3):
+        across = np.linalg.norm(np.cross(spans[:, k], spans[:, k - 1]), axis=1)
+        angle = np.arctan2(across, -np.einsum("ij,ij->i", spans[:, k], spans[:, k - 1]))
+        weighted[:, k] = angle[:, None] * normals
+    return weighted
+
+
 def _bend(span: Array, normal: Array, other: Array) -> Array:
     """The shortest vector with the span's parts along two normals, one of which may be 0."""
     cosine = np.sum(normal * other, axis=2, keepdims=True)
@@ -87,15 +95,9 @@ def _between(span: Array, one: Array, two: Array) -> Array:
     return np.asarray(turned / np.where(length > 0, length, 1.0))
 
 
-def _corner_normals(corners: Array, normals: Array, beyond: Numbers, fixed: Mask) -> Array:
+def _corner_normals(corners: Array, normals: Array, beyond: Index, fixed: Mask) -> Array:
     """Unit normals at the corners of each triangle, (m, 3, 3)."""
-    m = len(corners)
-    spans = np.roll(corners, -1, axis=1) - corners
-    weighted = np.empty_like(corners)
-    for k in range(3):
-        across = np.linalg.norm(np.cross(spans[:, k], spans[:, k - 1]), axis=1)
-        angle = np.arctan2(across, -np.einsum("ij,ij->i", spans[:, k], spans[:, k - 1]))
-        weighted[:, k] = angle[:, None] * normals
+    m, weighted = len(corners), weighted_normals(corners, normals)
     edge = np.flatnonzero(~fixed.ravel())
     back = beyond.ravel()[edge]
     after, back_after = (3 * (e // 3) + (e % 3 + 1) % 3 for e in (edge, back))

@@ -15,6 +15,7 @@ from fenics_contact.obstacles.base import (
     Obstacle,
     Placement,
     Rotation,
+    ToUFL,
     as_positive,
     as_vector,
     nonzero_vector,
@@ -27,10 +28,7 @@ __all__ = [
     "PrescribedGap",
     "RoundedCone",
     "SignedDistance",
-    "ToUFL",
 ]
-
-ToUFL = Callable[[Any], ufl.core.expr.Expr]
 
 
 @dataclass(frozen=True)

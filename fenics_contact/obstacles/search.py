@@ -8,11 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Index
 
 __all__ = ["FacetSearch"]
-
-Numbers = npt.NDArray[np.intp]
 
 # Longest edge of pieces by the height of the triangle they are cut from; and how many more pieces
 # than twice the triangles there may be.
@@ -52,15 +50,15 @@ class FacetSearch:
         self._facets = np.asarray(pairs[:, 1], dtype=np.intp)
         self._first = np.searchsorted(pairs[:, 0], np.arange(len(places) + 1))
         grade = np.floor(np.log(largest.max() / largest) / np.log(_GRADES)).astype(np.intp)
-        self._trees: list[tuple[cKDTree, Numbers, float]] = []
+        self._trees: list[tuple[cKDTree, Index, float]] = []
         for g in np.unique(grade):
             some = np.flatnonzero(grade == g)
             tree = cKDTree(places[some], leafsize=16, balanced_tree=False)
             self._trees.append((tree, some, float(largest[some].max())))
 
     def closest(
-        self, x: Array, distance: Callable[[Array, Numbers], Array], tolerance: float
-    ) -> Numbers:
+        self, x: Array, distance: Callable[[Array, Index], Array], tolerance: float
+    ) -> Index:
         """The closest facet of each point: the first of those that are closest.
 
         Args:
@@ -109,15 +107,13 @@ class FacetSearch:
         np.minimum.at(chosen, point[same], facet[same])
         return chosen
 
-    def _distances(
-        self, x: Array, keys: Numbers, distance: Callable[[Array, Numbers], Array]
-    ) -> Array:
+    def _distances(self, x: Array, keys: Index, distance: Callable[[Array, Index], Array]) -> Array:
         """Of pairs of points and facets."""
         parts = np.array_split(keys, 1 + len(keys) // _TOGETHER)
         pairs = [np.divmod(part, len(self._low)) for part in parts]
         return np.concatenate([distance(x[point], facet) for point, facet in pairs])
 
-    def _near(self, x: Array, bound: Array, points: Numbers, corners: Numbers) -> Numbers:
+    def _near(self, x: Array, bound: Array, points: Index, corners: Index) -> Index:
         """`_around`, without facets whose boxes are farther than the bounds of the points."""
         keys = np.unique(self._around(points, corners))
         point, facet = np.divmod(keys, len(self._low))
@@ -125,7 +121,7 @@ class FacetSearch:
         square = np.sum(np.maximum(away, 0.0) ** 2, axis=1)
         return keys[square <= bound[point] ** 2 * (1 + 1e-12)]
 
-    def _around(self, points: Numbers, corners: Numbers) -> Numbers:
+    def _around(self, points: Index, corners: Index) -> Index:
         """Pairs of points and of all facets at a corner for each, as one number a pair."""
         counts = self._first[corners + 1] - self._first[corners]
         starts = np.repeat(self._first[corners] - np.cumsum(counts) + counts, counts)
@@ -133,11 +129,11 @@ class FacetSearch:
         return np.repeat(points, counts) * len(self._low) + facets
 
 
-def _joined(lists: npt.NDArray[np.object_]) -> Numbers:
+def _joined(lists: npt.NDArray[np.object_]) -> Index:
     return np.concatenate([np.asarray(found, dtype=np.intp) for found in [[], *lists]])
 
 
-def _cut(triangles: Array) -> tuple[Array, Numbers]:
+def _cut(triangles: Array) -> tuple[Array, Index]:
     """Pieces of triangles, no longer than some heights of these, and the triangle of each."""
     facet, most = np.arange(len(triangles)), 2 * len(triangles) + _MOST
     edges = np.roll(triangles, -1, axis=1) - triangles
