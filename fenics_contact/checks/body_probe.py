@@ -48,7 +48,7 @@ class OpposingBodyProbe:
         self._search, self.u = search, contact.u.copy()
         self._before = before if known is None else known.u
         self._comm = contact.surface.mesh.comm
-        self._rows = contact.quadrature.point_rows()
+        self._rows = contact.quadrature.point_rows
         values = contact.values
         here, there = search.rays.here, search.rays.there
         deepest = global_max(self._comm, values.depth)

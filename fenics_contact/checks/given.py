@@ -317,7 +317,7 @@ def _n_doubled(one: Contact, other: Contact) -> int:
     _, *shared = np.intersect1d(one.surface.facets, other.surface.facets, return_indices=True)
     places, facing = [], np.ones(len(shared[0]), dtype=np.bool_)
     for contact, rows in zip((one, other), shared, strict=True):
-        points, values = contact.quadrature.point_rows()[rows], contact.values
+        points, values = contact.quadrature.point_rows[rows], contact.values
         # Means, as rules may differ, and the order of points on a facet does.
         gap = contact.opposite.undeformed_gap(values)
         places.append([a[points].mean(axis=1) for a in (gap, values.normal)])

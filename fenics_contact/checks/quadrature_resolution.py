@@ -65,7 +65,7 @@ def warn_of_divided_facets(contact: Contact) -> bool:
     """
     if not contact.opposite.follows:
         return False
-    comm, points = contact.surface.mesh.comm, contact.quadrature.point_rows()
+    comm, points = contact.surface.mesh.comm, contact.quadrature.point_rows
     paired = contact.values.paired[points]
     divided = paired.any(axis=1) & ~paired.all(axis=1)
     force = (contact.measure * contact.pressure)[points].sum(axis=1)

@@ -66,7 +66,7 @@ class VaryingMotion:
 
     def __init__(self, quadrature: SurfaceQuadrature) -> None:
         """Take the points. Collective."""
-        self._rows = quadrature.point_rows()
+        self._rows = quadrature.point_rows
         d = quadrature.surface.mesh.geometry.dim
         self._fields = PointFields(quadrature, {"moved": d})
         self.moved = self._fields.ufl("moved")

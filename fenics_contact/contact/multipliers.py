@@ -277,7 +277,7 @@ def _patches(quadrature: SurfaceQuadrature) -> tuple[Index, int]:
     """
     space = fem.functionspace(quadrature.surface.submesh, ("Lagrange", 1))
     n_patches, of_node = connected_bodies(space)
-    rows = quadrature.point_rows()
+    rows = quadrature.point_rows
     cells = np.argsort(quadrature.surface.parent_facets())
     patch = np.zeros(quadrature.n_points, dtype=np.intp)
     patch[rows.ravel()] = np.repeat(of_node[space.dofmap.list[cells, 0]], rows.shape[1])

@@ -254,7 +254,7 @@ def _bearing_facets(problem: ContactProblem) -> tuple[float, float]:
     sums = np.zeros(2)
     for contact in problem.contacts:
         quadrature = contact.quadrature
-        rows = quadrature.point_rows()
+        rows = quadrature.point_rows
         area = quadrature.weights[rows].sum(axis=1)
         bears = np.any(contact.pressure[rows] > 0, axis=1)
         sums += [np.sum(bears * area ** (1 / (d - 1))), np.count_nonzero(bears)]

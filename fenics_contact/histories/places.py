@@ -203,7 +203,7 @@ def node_places(space: fem.FunctionSpace) -> Array:
 
 def point_places(contact: Contact) -> Array:
     """Coordinates of the owned points and middle of their cell, (n, 2 gdim). Collective."""
-    surface, rows = contact.surface, contact.quadrature.point_rows()
+    surface, rows = contact.surface, contact.quadrature.point_rows
     cells = facet_cells(surface.mesh, surface.facets)
     middles = np.empty_like(contact.points)
     middles[rows] = _middles(surface.mesh)[cells][:, None]

@@ -102,7 +102,7 @@ class FirstTouch:
         them, as a ball does that stands on a node.
         """
         contact, comm = part.contact, self._full.unknowns.comm
-        rows = contact.quadrature.point_rows()
+        rows = contact.quadrature.point_rows
         gap = _gap(part, way)
         acting = np.abs(contact.values.friction_bound) + np.abs(contact.values.normal_traction)
         least, most = gap[rows].min(axis=1), np.where(gap < np.inf, gap, -np.inf)[rows].max(axis=1)

@@ -55,7 +55,7 @@ def along(contact: Contact, unit: str = "mm") -> Along | None:
         unit: Of length, for the label.
     """
     facets = FacetSet(contact.displacement.u.function_space, contact.surface.facets)
-    rows = contact.quadrature.point_rows()
+    rows = contact.quadrature.point_rows
     fields = {
         "x": contact.points,
         "gap": contact.gap,

@@ -254,7 +254,7 @@ def surface_of(contact: Contact, values: npt.NDArray[Any], magnification: float)
         mesh.comm, FacetSet(u.function_space, contact.surface.facets).mean_normals().sum(axis=0)
     )
     shape = ShapeOf(u)()
-    status = contact.status[contact.quadrature.point_rows()]
+    status = contact.status[contact.quadrature.point_rows]
     bearing = mesh.comm.gather(np.any(status != Status.OPEN, axis=1))
     gathered = facets_of(contact, values)
     if gathered is None or bearing is None or shape is None:

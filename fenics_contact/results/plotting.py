@@ -119,7 +119,7 @@ def plot_field(
         raise ValueError(f"field is {field!r}; use one of {list(_FIELDS)}")
     drawing.check_near(near)
     at_points = _field(contact, field)
-    rows = contact.quadrature.point_rows()
+    rows = contact.quadrature.point_rows
     values, weights = at_points[rows], contact.quadrature.weights[rows]
     known = np.isfinite(values)
     total = np.sum(weights * known, axis=1)

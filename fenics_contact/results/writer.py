@@ -255,7 +255,7 @@ class _Surface:
         every = np.arange(len(surface.facets))
         self._facets, self._shape = facets, (len(every), len(nodes), surface.mesh.geometry.dim)
         self._where = np.repeat(every, len(nodes)), np.tile(nodes, (len(every), 1))
-        self._rows = contact.quadrature.point_rows()
+        self._rows = contact.quadrature.point_rows
 
     def grids(self) -> tuple[vtu.Grid, vtu.Grid]:
         """This rank's facets and points as they are now. Collective."""
@@ -300,7 +300,7 @@ class _Surface:
 
 def facet_status(contact: Contact) -> npt.NDArray[np.int8]:
     """`Status` of most of the points of every facet of this rank, (n_facets,)."""
-    status = contact.status[contact.quadrature.point_rows()]
+    status = contact.status[contact.quadrature.point_rows]
     return np.stack([np.sum(status == s, axis=1) for s in Status]).argmax(axis=0).astype(np.int8)
 
 

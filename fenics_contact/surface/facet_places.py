@@ -81,7 +81,7 @@ class FacetPlaces:
             x: Undeformed places of this rank's points, (n_points, gdim) (length).
         """
         self.facets = FacetSet(space, quadrature.surface.facets)
-        self.rows = quadrature.point_rows()
+        self.rows = quadrature.point_rows
         n_facets, n_points = self.rows.shape
         d = space.mesh.geometry.dim
         self.size = quadrature.weights[self.rows].sum(axis=1) ** (1.0 / (d - 1))

@@ -391,7 +391,7 @@ class Pairing:
     ) -> PETSc.Mat:
         """L2 projection, facet by facet, from the pieces' points to the quadrature points."""
         d = self._d
-        rows = self._quadrature.point_rows()
+        rows = self._quadrature.point_rows
         basis = polynomials(d, self._here.simplex, rows.shape[1])
         order = np.argsort(facet, kind="stable")
         bounds = np.searchsorted(facet[order], np.arange(len(rows) + 1))
@@ -461,7 +461,7 @@ class Pairing:
         degree = self._there.space.ufl_element().degree
         found = self._quadrature.degree + degree
         if self._d == 3 and not self._here.simplex:
-            n_points = self._quadrature.point_rows().shape[1]
+            n_points = self._quadrature.point_rows.shape[1]
             own = polynomials(self._d, self._here.simplex, n_points).degree
             found = max(found, 2 * (own + max(own, degree)))
         return int(found)

@@ -240,7 +240,7 @@ class Rays:
         self.here = Side(FacetSet(space, quadrature.surface.facets), self.body)
         self.there = Side(FacetSet(space, opposite), self.body)
         # The points of a facet are the dofs of a submesh cell.
-        rows = quadrature.point_rows()
+        rows = quadrature.point_rows
         self.facet = np.empty(quadrature.n_points, dtype=np.int64)
         self.facet[rows.ravel()] = np.repeat(np.arange(len(rows)), rows.shape[1])
 

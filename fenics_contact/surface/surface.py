@@ -413,22 +413,19 @@ class SurfaceQuadrature:
             )
         return fem.functionspace(self.surface.submesh, element)
 
+    @cached_property
     def point_rows(self) -> npt.NDArray[np.int32]:
         """Points of every facet of this rank, (n_facets, n_points_per_facet).
 
         Row i is that of ``surface.facets[i]``.
         """
-        return self._point_rows
-
-    @cached_property
-    def _point_rows(self) -> npt.NDArray[np.int32]:
         parents = self.surface.parent_facets()
         return self.space().dofmap.list[: parents.size][np.argsort(parents)]
 
     @cached_property
     def facet_sizes(self) -> Array:
         """Length of the point's facet, in space the root of its area, (n_points,) (length)."""
-        rows, sizes = self.point_rows(), np.empty(self.n_points)
+        rows, sizes = self.point_rows, np.empty(self.n_points)
         areas = self.weights[rows].sum(axis=1)
         sizes[rows] = areas[:, None] ** (1.0 / (self.surface.mesh.geometry.dim - 1))
         return sizes

@@ -282,7 +282,7 @@ class ReferenceScales:
 
 def body_of_points(contact: Contact, space: fem.FunctionSpace, body: npt.NDArray[np.intp]) -> Index:
     """The body behind each of this rank's points of Γc, (n_points,)."""
-    rows = contact.quadrature.point_rows()
+    rows = contact.quadrature.point_rows
     cells = facet_cells(space.mesh, contact.surface.facets)
     own = np.zeros(contact.quadrature.n_points, dtype=np.intp)
     own[rows.ravel()] = np.repeat(body[space.dofmap.list[cells, 0]], rows.shape[1])
