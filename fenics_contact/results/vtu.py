@@ -15,57 +15,39 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
+import basix
+import dolfinx
+import dolfinx.io.utils
 import numpy as np
 import numpy.typing as npt
 
 from fenics_contact.types import Array
 
-__all__ = ["CELLS", "Cell", "Grid", "read_series", "write_grid", "write_series"]
+__all__ = ["CELLS", "Grid", "nodes", "read_series", "write_grid", "write_series"]
 
 
-@dataclass(frozen=True)
-class Cell:
-    """A kind of cell as VTK has it.
-
-    Attributes:
-        number: VTK's, of cells of degree 1 and 2.
-        corners: The corners in VTK's order, by the numbers of Basix.
-        middles: Of every node that degree 2 has beyond the corners, the corners (by VTK's numbers)
-            in the middle of which it is.
-    """
-
-    number: tuple[int, int]
-    corners: tuple[int, ...]
-    middles: tuple[tuple[int, ...], ...]
-
-    def nodes(self, corners: Array, degree: int) -> Array:
-        """Places of the nodes in VTK's order, (n_nodes, d).
-
-        Args:
-            corners: Places of the corners in the order of Basix.
-            degree: 1 or 2.
-        """
-        at = corners[list(self.corners)]
-        if degree == 1:
-            return at
-        return np.vstack([at, *(at[list(some)].mean(axis=0) for some in self.middles)])
-
-
-_SQUARE = ((0, 1), (1, 2), (2, 3), (3, 0))
-_CUBE = (
-    *(*_SQUARE, (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)),
-    *((0, 3, 4, 7), (1, 2, 5, 6), (0, 1, 4, 5), (2, 3, 6, 7), (0, 1, 2, 3), (4, 5, 6, 7)),
-    tuple(range(8)),
-)
-# By DOLFINx's names. The orders are those of the VTK file formats.
+# VTK's numbers of cells of degree 1 and 2, by DOLFINx's names.
 CELLS = {
-    "point": Cell((1, 1), (0,), ()),
-    "interval": Cell((3, 21), (0, 1), ((0, 1),)),
-    "triangle": Cell((5, 22), (0, 1, 2), ((0, 1), (1, 2), (2, 0))),
-    "quadrilateral": Cell((9, 28), (0, 1, 3, 2), (*_SQUARE, (0, 1, 2, 3))),
-    "tetrahedron": Cell((10, 24), (0, 1, 2, 3), ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))),
-    "hexahedron": Cell((12, 29), (0, 1, 3, 2, 4, 5, 7, 6), _CUBE),
+    "point": (1, 1),
+    "interval": (3, 21),
+    "triangle": (5, 22),
+    "quadrilateral": (9, 28),
+    "tetrahedron": (10, 24),
+    "hexahedron": (12, 29),
 }
+
+
+def nodes(cell: str, degree: int) -> Array:
+    """Reference coordinates of a cell's nodes in VTK's order, (n_nodes, d).
+
+    Args:
+        cell: DOLFINx's name.
+        degree: 1 or 2.
+    """
+    kind, equispaced = basix.CellType[cell], basix.LagrangeVariant.equispaced
+    places = basix.create_element(basix.ElementFamily.P, kind, degree, equispaced).points
+    order = dolfinx.io.utils.cell_perm_vtk(dolfinx.mesh.CellType[cell], len(places))
+    return np.asarray(places[np.argsort(order)], dtype=np.float64)
 
 
 @dataclass(frozen=True)

@@ -151,7 +151,7 @@ class Writer:
         """Surfaces of the rigid obstacles about the body, deformed or not. On the first rank."""
         x = body.points
         box = box_about(np.stack([x, x + body.at_nodes["displacement"]]), _ABOUT)
-        kind = vtu.CELLS["interval" if x.shape[2] == 2 else "triangle"].number[0]
+        kind = vtu.CELLS["interval" if x.shape[2] == 2 else "triangle"][0]
         return {name: vtu.Grid(kind, shape(box)) for name, shape in self._obstacles.items()}
 
     def _path(self, name: str) -> Path:
@@ -192,8 +192,8 @@ class _Body:
         d, name = mesh.geometry.dim, mesh.topology.cell_name()
         kind, degree = basix.CellType[name], problem.displacement.degree
         order = min(degree, 2)
-        self._number = vtu.CELLS[name].number[order - 1]
-        nodes = vtu.CELLS[name].nodes(basix.geometry(kind), order)
+        self._number = vtu.CELLS[name][order - 1]
+        nodes = vtu.nodes(name, order)
         places = ufl.SpatialCoordinate(mesh), problem.displacement.expression
         parts = [e[i] for e in places for i in range(d)]
         self._n_nodes, self._places = len(nodes), compile_expression(ufl.as_vector(parts), nodes)
@@ -250,8 +250,8 @@ class _Surface:
         facets = FacetSet(self._u.function_space, surface.facets)
         name = surface.submesh.topology.cell_name()
         order = min(displacement.degree, 2)
-        self._number = vtu.CELLS[name].number[order - 1]
-        nodes = vtu.CELLS[name].nodes(basix.geometry(basix.CellType[name]), order)
+        self._number = vtu.CELLS[name][order - 1]
+        nodes = vtu.nodes(name, order)
         every = np.arange(len(surface.facets))
         self._facets, self._shape = facets, (len(every), len(nodes), surface.mesh.geometry.dim)
         self._where = np.repeat(every, len(nodes)), np.tile(nodes, (len(every), 1))
@@ -281,7 +281,7 @@ class _Surface:
         points = {name: values[order][:, None] for name, values in all_points.items()}
         return (
             vtu.Grid(self._number, nodes, at_nodes, in_facets),
-            vtu.Grid(vtu.CELLS["point"].number[0], contact.points[order][:, None], points),
+            vtu.Grid(vtu.CELLS["point"][0], contact.points[order][:, None], points),
         )
 
     def _values(self) -> dict[str, Array]:
