@@ -150,7 +150,7 @@ class PresentPairs(Pairs):
         along, spans = _reciprocal(tangents)
         self.degenerate = bool(self._mesh.comm.allreduce(int(not spans.all())))
         normal = here.outward_normals(facet, tangents)
-        deep = np.maximum(self.search.largest(history.values("penetration")), 0.0)
+        deep = self.search.largest(history.values("penetration"))
         if not global_max(self._mesh.comm, np.abs(self._before.x.array)) > 0:
             deep = np.maximum(deep, self._at_rest[1])
         hits = self._rays.follow(

@@ -253,11 +253,10 @@ def _bearing_facets(problem: ContactProblem) -> tuple[float, float]:
     d = problem.u.function_space.mesh.geometry.dim
     sums = np.zeros(2)
     for contact in problem.contacts:
-        quadrature = contact.quadrature
-        rows = quadrature.point_rows
-        area = quadrature.weights[rows].sum(axis=1)
+        rows = contact.quadrature.point_rows
         bears = np.any(contact.pressure[rows] > 0, axis=1)
-        sums += [np.sum(bears * area ** (1 / (d - 1))), np.count_nonzero(bears)]
+        sizes = contact.quadrature.facet_sizes[rows[:, 0]]
+        sums += [np.sum(bears * sizes), np.count_nonzero(bears)]
     size, count = global_sum(problem.u.function_space.mesh.comm, sums)
     return (float(size / count), float(count ** (1 / (d - 1)))) if count else (0.0, 0.0)
 

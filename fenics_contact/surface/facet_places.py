@@ -84,7 +84,7 @@ class FacetPlaces:
         self.rows = quadrature.point_rows
         n_facets, n_points = self.rows.shape
         d = space.mesh.geometry.dim
-        self.size = quadrature.weights[self.rows].sum(axis=1) ** (1.0 / (d - 1))
+        self.size = quadrature.facet_sizes[self.rows[:, 0]]
         facet = np.repeat(np.arange(n_facets), n_points)
         normal = self.facets.mean_normals()
         at, *_ = self.facets.meet(facet, x[self.rows.ravel()], normal[facet])

@@ -113,7 +113,7 @@ class Pairing:
             And why there is none, one of `rays.REASONS`, (n_points,).
         """
         place = self._located(x, normal)
-        deep = np.maximum(self.largest(penetration), 0.0)
+        deep = self.largest(penetration)
         if u is None:
             found, start = self.at_rest(place, x, normal)
             deep = np.maximum(deep, start)
@@ -165,7 +165,7 @@ class Pairing:
                 deep[self._sides[0].first + self._facet[inside]] = np.inf
                 self._comm.Allreduce(MPI.IN_PLACE, deep, op=MPI.MAX)
                 found = self.rays.follow(self._facet, place, normal, None, deep)
-        return found, np.maximum(self.largest(np.nan_to_num(-found.distance)), 0.0)
+        return found, self.largest(np.nan_to_num(-found.distance))
 
     def faceting(self, side: Side) -> Array:
         """How far each of all facets may be from a smooth or a flat surface (length). Collective.
@@ -202,8 +202,8 @@ class Pairing:
         return slack
 
     def largest(self, values: Array) -> Array:
-        """The largest of the points' values on each of all facets of Γc. Collective."""
-        largest = np.full(len(self._here.cells), -np.inf)
+        """The largest of the points' values on each of all facets of Γc, ≥ 0. Collective."""
+        largest = np.zeros(len(self._here.cells))
         np.maximum.at(largest, self._facet, values)
         return np.concatenate(self._comm.allgather(largest))
 
@@ -287,7 +287,7 @@ class Pairing:
             reference = np.concatenate([self._located(x, along), reference])
             normal = self._here.normals(facet, reference, u)
             undeformed = self._here.normals(facet, reference)
-            deep = np.maximum(self.largest(penetration), 0.0)
+            deep = self.largest(penetration)
             hits = self.rays.follow(
                 facet, reference, normal, u, deep, undeformed=undeformed, before=u
             )
@@ -326,7 +326,7 @@ class Pairing:
             (n_points,) (length), NaN where there is no opposite.
         """
         place = self._located(x, along)
-        deep = np.maximum(self.largest(penetration), 0.0)
+        deep = self.largest(penetration)
         found = self.rays.follow(self._facet, place, along, at, deep)
         matrix = found.matrix(self._space)
         product = matrix.createVecLeft()

@@ -16,7 +16,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact.obstacles.deformable import DeformableBody
-from fenics_contact.parallel import gather_rows
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.facets import FacetSet
 from fenics_contact.surface.surface import SurfaceQuadrature, tagged_facets
@@ -64,17 +63,23 @@ class Side:
         """
         comm = facets.space.mesh.comm
         self.facets = facets
-        own = facets.vertices()
         corners = facets.moved_corners(None)
-        self.first = comm.exscan(len(own)) or 0
-        self.own = slice(self.first, self.first + len(own))
-        self.vertices = np.concatenate(comm.allgather(own))
-        self.corners: Index = np.concatenate(comm.allgather(facets.corner_vertices()))
-        self.body = np.concatenate(comm.allgather(body[facets.space.dofmap.list[facets.cells, 0]]))
-        self.height = np.concatenate(comm.allgather(facets.heights()))
         between = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=3)
-        self.length = np.concatenate(comm.allgather(between.max(axis=(1, 2), initial=0.0)))
-        self.middle = gather_rows(comm, corners.mean(axis=1))
+        ranks = comm.allgather(
+            (
+                facets.vertices(),
+                facets.corner_vertices(),
+                body[facets.space.dofmap.list[facets.cells, 0]],
+                facets.heights(),
+                between.max(axis=(1, 2), initial=0.0),
+                corners.mean(axis=1),
+            )
+        )
+        self.vertices, self.corners, self.body, self.height, self.length, self.middle = (
+            np.concatenate(parts) for parts in zip(*ranks, strict=True)
+        )
+        self.first = sum(len(vertices) for vertices, *_ in ranks[: comm.rank])
+        self.own = slice(self.first, self.first + len(corners))
 
 
 class _Admission:
