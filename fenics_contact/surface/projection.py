@@ -72,30 +72,18 @@ def cut_lines(
     """Cut the facets of a plane problem at the ends of the opposite ones."""
     rule, shares = basix.make_quadrature(basix.CellType.interval, degree)
     first, second = pairs
-    facets, others, points, weights = [], [], [], []
-    for f in np.unique(first):
-        origin, edge = here[f, 0], here[f, 1] - here[f, 0]
-        other = second[first == f]
-        ends = (there[other] - origin) @ edge / (edge @ edge)
-        low, high = ends.min(axis=1).clip(0, 1), ends.max(axis=1).clip(0, 1)
-        kept = high - low > NEGLIGIBLE
-        low, high, other = low[kept], high[kept], other[kept]
-        if (high - low).sum() < 1 - FLAT:
-            continue
-        along = (low[:, None] + (high - low)[:, None] * rule[None, :, 0]).ravel()
-        facets.append(np.full(along.size, f))
-        others.append(np.repeat(other, len(rule)))
-        points.append(origin + along[:, None] * edge)
-        weights.append(((high - low)[:, None] * shares[None]).ravel())
-    none = np.zeros(0, dtype=np.int64)
-    weight = np.concatenate([np.zeros(0), *weights])
-    return (
-        np.concatenate([none, *facets]),
-        np.concatenate([none, *others]),
-        np.concatenate([np.zeros((0, 2)), *points]),
-        weight,
-        weight,
-    )
+    origin, edge = here[:, 0], here[:, 1] - here[:, 0]
+    ends = np.einsum("pkd,pd->pk", there[second] - origin[first][:, None], edge[first])
+    ends = (ends / np.einsum("fd,fd->f", edge, edge)[first][:, None]).clip(0, 1)
+    low, size = ends.min(axis=1), ends.max(axis=1) - ends.min(axis=1)
+    size = np.where(size > NEGLIGIBLE, size, 0.0)
+    covered = np.bincount(first, size, len(here)) >= 1 - FLAT
+    kept = np.flatnonzero((size > 0) & covered[first])
+    low, size = low[kept, None], size[kept, None]
+    facet, other = np.repeat(first[kept], len(rule)), np.repeat(second[kept], len(rule))
+    along = (low + size * rule[None, :, 0]).ravel()
+    weight = (size * shares[None]).ravel()
+    return facet, other, origin[facet] + along[:, None] * edge[facet], weight, weight
 
 
 def cut_polygons(
