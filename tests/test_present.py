@@ -15,6 +15,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import compat
+from fenics_contact.checks.body_probe import OpposingBodyProbe
 from fenics_contact.checks.tunnelling import TunnellingCheck
 from fenics_contact.elasticity import NeoHookean
 from fenics_contact.systems.operator import ContactOperator
@@ -333,6 +334,16 @@ def _led(cell, ways):
 def _crossed(pair):
     """A place that has crossed the other body since the last commit."""
     return TunnellingCheck([pair.contact]).evaluate(pair.before)["contact"].crossed
+
+
+def test_points_of_bodies_that_turned_before_are_where_they_are():
+    """A probe whose first bodies have turned so far that normals are along the undeformed Γc."""
+    pair = Pair("triangle", LAWS["coulomb"], kinematics="finite")
+    pair.place(pair.pressed(pair.nodes, 0.05, 0.0) @ turn(2, np.pi / 2).T)
+    pair.contact.evaluate()
+    x = pair.contact.values.x
+    probe = OpposingBodyProbe(pair.contact, None)
+    assert probe.x[: len(x)] == pytest.approx(x, rel=0, abs=1e-12)
 
 
 @pytest.mark.each

@@ -53,7 +53,7 @@ class OpposingBodyProbe:
         here, there = search.rays.here, search.rays.there
         deepest = global_max(self._comm, values.depth)
         near, opposite = search.nearby(self.u, self._before, deepest)
-        found = search.present_hits(values.x, values.normal, contact.u, values.depth, near)
+        found = search.present_hits(values.x, contact.u, values.depth, near)
         self._here = _Side(here, self.u, found.facet, found.reference)
         self._there = _Side(there, self.u, *there.facets.lattice(opposite))
         everywhere, n_back = np.arange(len(self._there.facet)), len(self._there.side.body)
@@ -126,7 +126,7 @@ class OpposingBodyProbe:
         deep = np.maximum(resisted_here, resisted_there)
         edges = np.sqrt(self.x.shape[1] - 1)  # lengths are those of diagonals in space
         size, other = here.side.length[on] / edges, there.side.length[opposite] / edges
-        slack = self._search.faceting(here.side)[on] + self._search.faceting(there.side)[opposite]
+        slack = here.side.faceting[on] + there.side.faceting[opposite]
         met = ~np.isnan(np.concatenate([hits.distance, back.distance]))
         # A place opposite stands for the one of Γc that its normal meets.
         foot = there.place + np.nan_to_num(back.distance)[:, None] * there.normal

@@ -187,7 +187,7 @@ class Pairs:
         """See `Opposite.true_placement`. Collective."""
         assert self.search is not None
         depth = self.depth(values.normal_displacement)
-        return self.search.true_gap(values.x, values.normal, self._u, depth)
+        return self.search.true_gap(values.x, self._u, depth)
 
     def linear_gap(self, values: PointValues) -> Array:
         """The gap between the pairs as they are, linearised where they were found. Collective."""

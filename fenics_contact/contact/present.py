@@ -123,15 +123,14 @@ class PresentPairs(Pairs):
             history: The committed state.
             traction: That, or multipliers: what the return map starts from.
         """
-        comm, here = self._mesh.comm, self._rays.here.facets
         if self._where is None:
             assert self.search is not None
-            place, *_ = here.meet(self._rays.facet, x, normal)
+            place = self.search.located(x)
             self._where = place, normal
             met, deep = self.search.at_rest(place, x, normal)
             self._at_rest = np.nan_to_num(met.distance), deep
         changed = self._at is None or not np.array_equal(self._at, self._u.x.array)
-        if comm.allreduce(int(changed)) or self._present is None:
+        if self._mesh.comm.allreduce(int(changed)) or self._present is None:
             self._at = self._u.x.array.copy()
             self._find(history)
         self._feel(history, traction)

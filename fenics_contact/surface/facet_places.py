@@ -86,8 +86,7 @@ class FacetPlaces:
         d = space.mesh.geometry.dim
         self.size = quadrature.facet_sizes[self.rows[:, 0]]
         facet = np.repeat(np.arange(n_facets), n_points)
-        normal = self.facets.mean_normals()
-        at, *_ = self.facets.meet(facet, x[self.rows.ravel()], normal[facet])
+        at = self.facets.locate(facet, x[self.rows.ravel()])
         more, corners = self.facets.lattice()
         self.facet, self.reference = np.append(facet, more), np.concatenate([at, corners])
         # No higher degree than that of geometry and displacement: many points are fitted then.

@@ -314,6 +314,17 @@ class FacetSet:
         for target, values in zip(best, (facet, place, distance), strict=True):
             target[point[chosen]] = values[chosen]
 
+    def locate(self, facet: Index, x: Array, u: fem.Function | None = None) -> Array:
+        """Reference coordinates of places on their facets, (n, d - 1).
+
+        Args:
+            facet: Facet of every place, (n,).
+            x: The places, (n, d); what is off the facet counts as if it were moved onto it along
+                the mean normal of the undeformed facet.
+            u: Displacement of the facets; none: they are undeformed.
+        """
+        return self.meet(facet, x, self.mean_normals()[facet], u)[0]
+
     def meet(
         self, facet: Index, x: Array, ray: Array, u: fem.Function | None = None
     ) -> tuple[Array, Array, Mask, Array]:

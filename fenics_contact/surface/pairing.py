@@ -33,7 +33,7 @@ from fenics_contact.surface.projection import (
     near_pairs,
     polynomials,
 )
-from fenics_contact.surface.rays import BEHIND, Hits, Rays, Side
+from fenics_contact.surface.rays import BEHIND, Hits, Rays
 from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.tolerances import FLAT
 from fenics_contact.types import Array, Index
@@ -43,9 +43,6 @@ __all__ = ["Pairing", "PresentHits"]
 
 # Of a distance, by the size of the coordinates that it is the difference of.
 _ROUND_OFF = 16 * np.finfo(float).eps
-# Angle between the normals of a facet and of the surface at its corner (radian), up to which the
-# facets stand for a smooth surface.
-_SMOOTH = 0.5
 
 
 @dataclass(frozen=True)
@@ -94,7 +91,6 @@ class Pairing:
         self._sides, self._facet, self._space = (rays.here, rays.there), rays.facet, space
         self._place: Array | None = None
         self._present: PresentHits | None = None
-        self._faceting: dict[int, Array] = {}
 
     def pair(
         self, x: Array, normal: Array, u: fem.Function | None, penetration: Array
@@ -112,7 +108,7 @@ class Pairing:
             *in the undeformed bodies*, so that s - u_n is the present one; NaN without opposite.
             And why there is none, one of `rays.REASONS`, (n_points,).
         """
-        place = self._located(x, normal)
+        place = self.located(x)
         deep = self.largest(penetration)
         if u is None:
             found, start = self.at_rest(place, x, normal)
@@ -167,40 +163,6 @@ class Pairing:
                 found = self.rays.follow(self._facet, place, normal, None, deep)
         return found, self.largest(np.nan_to_num(-found.distance))
 
-    def faceting(self, side: Side) -> Array:
-        """How far each of all facets may be from a smooth or a flat surface (length). Collective.
-
-        Of the undeformed surface: it is measured once.
-        """
-        if id(side) not in self._faceting:
-            self._faceting[id(side)] = self._measure_faceting(side)
-        return self._faceting[id(side)]
-
-    def _measure_faceting(self, side: Side) -> Array:
-        """How far from a smooth or a flat surface each of all facets may be (length). Collective.
-
-        Twice the height of the arc over its chord, by the angles between neighbours, and by those
-        between the ends of a facet that is curved itself.
-        """
-        facets, comm = side.facets, self._comm
-        n = len(facets.cells)
-        facet, place = facets.corners()
-        corners = facets.moved_corners(None)
-        normal = facets.normals(facet, place).reshape(n, corners.shape[1] + 1, self._d)[:, :-1]
-        size = np.linalg.norm(corners - corners.mean(axis=1)[:, None], axis=2).max(axis=1)
-        vertex = side.corners
-        flat = _angle(normal, facets.mean_normals()[:, None])
-        normal, size, flat = (gather_rows(comm, values) for values in (normal, size, flat))
-        _, number = np.unique(vertex, return_inverse=True)
-        number = number.reshape(vertex.shape)
-        mean = np.zeros((number.max() + 1, self._d))
-        np.add.at(mean, number, normal)
-        mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300)
-        angle = _angle(mean[number], normal)
-        angle[angle > _SMOOTH] = 0.0
-        slack: Array = size * np.maximum(angle, flat).max(axis=1)
-        return slack
-
     def largest(self, values: Array) -> Array:
         """The largest of the points' values on each of all facets of Γc, ≥ 0. Collective."""
         largest = np.zeros(len(self._here.cells))
@@ -240,14 +202,11 @@ class Pairing:
             found.append(mine[(mine >= 0) & (mine < len(side.facets.cells))])
         return found[0], found[1]
 
-    def true_gap(
-        self, x: Array, along: Array, u: fem.Function, penetration: Array
-    ) -> tuple[Array, Array]:
+    def true_gap(self, x: Array, u: fem.Function, penetration: Array) -> tuple[Array, Array]:
         """Distance to the opposite along the normal of Γc, both deformed. Collective.
 
         Args:
             x: The points in the undeformed body, (n_points, d).
-            along: Its normals there, (n_points, d).
             u: Displacement of the bodies.
             penetration: As for `pair`.
 
@@ -255,23 +214,17 @@ class Pairing:
             The distance, (n_points,) (length), NaN where there is no opposite; unit normals,
             (n_points, d).
         """
-        n = len(self._located(x, along))
-        found = self.present_hits(x, along, u, penetration)
+        n = len(self.located(x))
+        found = self.present_hits(x, u, penetration)
         return found.hits.distance[:n], found.normal[:n].copy()
 
     def present_hits(
-        self,
-        x: Array,
-        along: Array,
-        u: fem.Function,
-        penetration: Array,
-        facets: Index | None = None,
+        self, x: Array, u: fem.Function, penetration: Array, facets: Index | None = None
     ) -> PresentHits:
         """What the present normals of Γc meet, at points and between; once a state. Collective.
 
         Args:
             x: See `true_gap`.
-            along: See `true_gap`.
             u: See `true_gap`.
             penetration: See `true_gap`.
             facets: Of this rank on whose lattice to look, too; by default those of the last call.
@@ -284,7 +237,7 @@ class Pairing:
             facets = np.zeros(0, dtype=np.int64) if facets is None else facets
             facet, reference = self._here.lattice(facets)
             facet = np.concatenate([self._facet, facet])
-            reference = np.concatenate([self._located(x, along), reference])
+            reference = np.concatenate([self.located(x), reference])
             normal = self._here.normals(facet, reference, u)
             undeformed = self._here.normals(facet, reference)
             deep = self.largest(penetration)
@@ -295,10 +248,14 @@ class Pairing:
             self._present = present
         return present
 
-    def _located(self, x: Array, along: Array) -> Array:
-        """Reference coordinates of the points on their facets, (n_points, d - 1)."""
+    def located(self, x: Array) -> Array:
+        """Reference coordinates of the points on their facets, (n_points, d - 1); found once.
+
+        Args:
+            x: The points in the undeformed body, (n_points, d).
+        """
         if self._place is None:
-            self._place, *_ = self._here.meet(self._facet, x, along)
+            self._place = self._here.locate(self._facet, x)
         return self._place
 
     def linear_gap(
@@ -325,7 +282,7 @@ class Pairing:
         Returns:
             (n_points,) (length), NaN where there is no opposite.
         """
-        place = self._located(x, along)
+        place = self.located(x)
         deep = self.largest(penetration)
         found = self.rays.follow(self._facet, place, along, at, deep)
         matrix = found.matrix(self._space)
@@ -449,8 +406,7 @@ class Pairing:
         cut = cut_lines if d == 2 else cut_polygons
         pairs = facing_pairs(moved_here, mean, there, looks, away)
         facet, other, points, weights, share = cut(moved_here, mean, there, pairs, self._degree())
-        places, *_ = here.meet(facet, points, mean[facet], u)
-        return facet, other, places, weights, share
+        return facet, other, here.locate(facet, points, u), weights, share
 
     def _degree(self) -> int:
         """Degree of the integrands on a piece: polynomial of the points times displacement.
@@ -465,9 +421,3 @@ class Pairing:
             own = polynomials(self._d, self._here.simplex, n_points).degree
             found = max(found, 2 * (own + max(own, degree)))
         return int(found)
-
-
-def _angle(one: Array, other: Array) -> Array:
-    """Between unit vectors, by the chord: of its cosine half of the digits are lost."""
-    chord = np.linalg.norm(one - other, axis=-1)
-    return np.asarray(2 * np.arcsin(np.minimum(chord / 2, 1)), dtype=np.float64)

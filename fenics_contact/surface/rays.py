@@ -8,6 +8,7 @@ other, and so only up to the depth that they may (`Admission`).
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact.obstacles.deformable import DeformableBody
+from fenics_contact.parallel import gather_rows
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.facets import FacetSet
 from fenics_contact.surface.surface import SurfaceQuadrature, tagged_facets
@@ -29,6 +31,9 @@ __all__ = ["BEHIND", "REASONS", "Hits", "Partner", "Rays", "Side", "interpolatio
 # interference of a body with itself), and one whose cell shares a node with it (the lips of a
 # slit, meshed differently).
 _OWN, _JOINED = 0.5, 0.05
+# Angle between the normals of a facet and of the surface at its corner (radian), up to which the
+# facets stand for a smooth surface.
+_SMOOTH = 0.5
 # Why a point has no opposite, the likeliest last.
 _NOTHING, _FAR, BEHIND, _ITSELF = range(4)
 REASONS = {
@@ -80,6 +85,32 @@ class Side:
         )
         self.first = sum(len(vertices) for vertices, *_ in ranks[: comm.rank])
         self.own = slice(self.first, self.first + len(corners))
+
+    @cached_property
+    def faceting(self) -> Array:
+        """How far from a smooth or a flat surface each of all facets may be (length). Collective.
+
+        Of the undeformed surface: twice the height of the arc over its chord, by the angles between
+        neighbours, and by those between the ends of a facet that is curved itself.
+        """
+        facets = self.facets
+        comm, d = facets.space.mesh.comm, facets.space.mesh.topology.dim
+        facet, place = facets.corners()
+        corners = facets.moved_corners(None)
+        n, n_corners = corners.shape[:2]
+        normal = facets.normals(facet, place).reshape(n, n_corners + 1, d)[:, :-1]
+        size = np.linalg.norm(corners - corners.mean(axis=1)[:, None], axis=2).max(axis=1)
+        flat = _angle(normal, facets.mean_normals()[:, None])
+        normal, size, flat = (gather_rows(comm, values) for values in (normal, size, flat))
+        _, number = np.unique(self.corners, return_inverse=True)
+        number = number.reshape(self.corners.shape)
+        mean = np.zeros((number.max() + 1, d))
+        np.add.at(mean, number, normal)
+        mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300)
+        angle = _angle(mean[number], normal)
+        angle[angle > _SMOOTH] = 0.0
+        slack: Array = size * np.maximum(angle, flat).max(axis=1)
+        return slack
 
 
 class _Admission:
@@ -195,22 +226,17 @@ class Hits:
             others: The hits of these, (m, …).
         """
 
-        def replaced(mine: Any, theirs: Any) -> Any:
+        def completed(mine: Any, theirs: Any) -> Any:
+            if isinstance(mine, Hits | Partner):
+                names = [f.name for f in fields(mine)]
+                pairs = {name: (getattr(mine, name), getattr(theirs, name)) for name in names}
+                return type(mine)(**{name: completed(*pair) for name, pair in pairs.items()})
             values = mine.copy()
             values[rows] = theirs
             return values
 
-        partner = {
-            f.name: replaced(getattr(self.partner, f.name), getattr(others.partner, f.name))
-            for f in fields(Partner)
-        }
-        return Hits(
-            place=replaced(self.place, others.place),
-            distance=replaced(self.distance, others.distance),
-            facet=replaced(self.facet, others.facet),
-            reason=replaced(self.reason, others.reason),
-            partner=Partner(**partner),
-        )
+        found: Hits = completed(self, others)
+        return found
 
     def matrix(self, space: fem.FunctionSpace) -> PETSc.Mat:
         """Displacements of the places met, (d n, n_dofs); empty rows elsewhere. Collective."""
@@ -332,6 +358,12 @@ class Rays:
             return *first, *(np.zeros((len(facet), 0)) for _ in range(3))
         _, tangents = facets.positions(facet, where, u)
         return *first, tangents, *facets.positions(facet, where, before)
+
+
+def _angle(one: Array, other: Array) -> Array:
+    """Between unit vectors, by the chord: of its cosine half of the digits are lost."""
+    chord = np.linalg.norm(one - other, axis=-1)
+    return np.asarray(2 * np.arcsin(np.minimum(chord / 2, 1)), dtype=np.float64)
 
 
 def interpolation_matrix(
