@@ -44,7 +44,7 @@ class _Interpolation:
             n_basis: See above.
         """
         n_facets, n = rows.shape
-        basis = polynomials(at.shape[1] + 1, facets.simplex, min(n, n_basis))
+        basis = polynomials(facets.kind, min(n, n_basis))
         table = tabulate(basis, 0, at)[0, :, :, 0].reshape(n_facets, n, basis.dim)
         coefficients = np.linalg.pinv(table) if n_facets else table.swapaxes(1, 2)
         return cls(rows, basis, np.asarray(coefficients, dtype=np.float64))
@@ -83,7 +83,6 @@ class FacetPlaces:
         self.facets = FacetSet(space, quadrature.surface.facets)
         self.rows = quadrature.point_rows
         n_facets, n_points = self.rows.shape
-        d = space.mesh.geometry.dim
         self.size = quadrature.facet_sizes[self.rows[:, 0]]
         facet = np.repeat(np.arange(n_facets), n_points)
         at = self.facets.locate(facet, x[self.rows.ravel()])
@@ -91,13 +90,11 @@ class FacetPlaces:
         self.facet, self.reference = np.append(facet, more), np.concatenate([at, corners])
         # No higher degree than that of geometry and displacement: many points are fitted then.
         degree = max(space.ufl_element().degree, geometry_element(space.mesh).degree)
-        n_basis = (degree + 1) ** (d - 1)
-        if d == 3 and self.facets.simplex:
-            n_basis = (degree + 1) * (degree + 2) // 2
+        lattice = self.facets.interpolation_nodes(degree)
+        n_basis = len(lattice)
         self._at_points = _Interpolation.of(self.facets, self.rows, at, n_basis)
         self._nodes, self._at_nodes = self.reference[:0], self._at_points
         if n_points < n_basis:
-            lattice = self.facets.interpolation_nodes(degree)
             rows = np.arange(n_facets * len(lattice)).reshape(n_facets, len(lattice))
             self._nodes = np.tile(lattice, (n_facets, 1))
             self._at_nodes = _Interpolation.of(self.facets, rows, self._nodes, n_basis)

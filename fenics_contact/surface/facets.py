@@ -62,6 +62,8 @@ class FacetSet:
     Attributes:
         cells: Cell of every facet, (n_facets,).
         nodes: Of the displacement on every facet, numbered on this rank, (n_facets, n_nodes).
+        kind: Of the facets, as Basix has it.
+        simplex: Whether the cells are simplices.
         outward: Sign by which the facet's own orientation points out of the body, (n_facets,).
     """
 
@@ -80,27 +82,30 @@ class FacetSet:
         cell_type = basix.CellType[mesh.topology.cell_name()]
         geometry, topology = basix.geometry(cell_type), basix.topology(cell_type)
         corners = np.array([geometry[vertices] for vertices in topology[d - 1]])
-        at_corners = np.array(topology[d - 1])
         origins = corners[:, 0]
         edges = np.swapaxes(corners[:, 1:d] - corners[:, :1], 1, 2)
         self._origin, self._edges = origins[local], edges[local]
-        self._at_corners = at_corners[local]
         self.simplex = cell_type in (basix.CellType.triangle, basix.CellType.tetrahedron)
+        self.kind = basix.CellType.interval
+        if d == 3:
+            self.kind = basix.CellType["triangle" if self.simplex else "quadrilateral"]
+        places = basix.geometry(self.kind)
+        ring = [0, 1, 3, 2] if d == 3 and not self.simplex else list(range(d))
+        self._corners, self._middle = places[ring], places.mean(axis=0, keepdims=True)
+        self._at_corners = np.array(topology[d - 1])[local][:, ring]
         self._geometry_basis = compat.geometry_element(mesh)
         self._basis = space.element.basix_element
         self._nodes = compat.geometry_dofmap(mesh)[self.cells]
         self._dofs = space.dofmap.list[self.cells]
-        middle = 1 / d if self.simplex else 0.5
-        self._middle = np.full((1, d - 1), middle)
-        self._corners = np.vstack([np.zeros(d - 1), np.eye(d - 1)])
-        if not self.simplex and d == 3:
-            self._corners = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
-            self._at_corners = self._at_corners[:, [0, 1, 3, 2]]
-        every = np.arange(len(self.cells))
-        on_facet, tangents = self.positions(every, self._middle.repeat(len(every), axis=0))
+        on_facet, tangents = self.positions(*self._each(self._middle))
         table = tabulate(self._geometry_basis, 0, geometry.mean(axis=0)[None])[0, 0, :, 0]
         inside = np.einsum("k,pkd->pd", table, self._x[self._nodes][:, :, :d])
         self.outward = _side(tangents, on_facet - inside)
+
+    def _each(self, places: Array, facets: Index | None = None) -> tuple[Index, Array]:
+        """Facets, by default all, with each of the places, (m, d - 1): (n m,), (n m, d - 1)."""
+        facets = np.arange(len(self.cells)) if facets is None else facets
+        return np.repeat(facets, len(places)), np.tile(places, (len(facets), 1))
 
     def _in_cell(self, facet: Index, place: Array) -> Array:
         """Reference coordinates of the cell from those of the facet: (n, d)."""
@@ -148,27 +153,22 @@ class FacetSet:
 
     def moved_corners(self, u: fem.Function | None) -> Array:
         """Corners displaced by ``u``, (n_facets, n_corners, d)."""
-        n, k = len(self.cells), len(self._corners)
-        facet, place = np.repeat(np.arange(n), k), np.tile(self._corners, (n, 1))
-        return self.positions(facet, place, u)[0].reshape(n, k, self._d)
+        places, _ = self.positions(*self._each(self._corners), u)
+        return places.reshape(len(self.cells), len(self._corners), self._d)
 
     def balls(self, u: fem.Function | None) -> tuple[Array, Array]:
         """Balls around the facets displaced by ``u``: middles, (n_facets, d), and radii."""
-        every = np.arange(len(self.cells))
-        middle, _ = self.positions(every, self._middle.repeat(len(every), axis=0), u)
+        middle, _ = self.positions(*self._each(self._middle), u)
         away = np.linalg.norm(self.moved_corners(u) - middle[:, None], axis=2)
         return middle, _BENT * away.max(axis=1, initial=0.0)
 
     def mean_normals(self) -> Array:
         """Outward unit normals at the facets' middles, (n_facets, d)."""
-        every = np.arange(len(self.cells))
-        return self.normals(every, self._middle.repeat(len(every), axis=0))
+        return self.normals(*self._each(self._middle))
 
     def corners(self) -> tuple[Index, Array]:
         """Every facet with each of its corners and its middle: (n,), places (n, d - 1)."""
-        places = np.vstack([self._corners, self._middle])
-        every = np.arange(len(self.cells))
-        return np.repeat(every, len(places)), np.tile(places, (len(every), 1))
+        return self._each(np.vstack([self._corners, self._middle]))
 
     def lattice(self, facets: Index | None = None) -> tuple[Index, Array]:
         """Facets with their corners, the middles of their edges and their own middle.
@@ -183,8 +183,7 @@ class FacetSet:
         if self._d == 3:
             edges = (self._corners + np.roll(self._corners, -1, axis=0)) / 2
             places = np.vstack([places, edges])
-        facets = np.arange(len(self.cells)) if facets is None else facets
-        return np.repeat(facets, len(places)), np.tile(places, (len(facets), 1))
+        return self._each(places, facets)
 
     def interpolation_nodes(self, degree: int) -> Array:
         """Reference coordinates on a facet of the nodes of polynomials, (n, d - 1).
@@ -192,11 +191,7 @@ class FacetSet:
         Args:
             degree: Of the polynomials.
         """
-        along = np.linspace(0.0, 1.0, degree + 1)
-        grid = np.meshgrid(*[along] * (self._d - 1), indexing="ij")
-        nodes = np.column_stack([g.ravel() for g in grid])
-        inside = nodes.sum(axis=1) < 1.0 + 0.5 / degree
-        return nodes[inside] if self.simplex and self._d == 3 else nodes
+        return basix.create_lattice(self.kind, degree, basix.LatticeType.equispaced, True)
 
     def flat_pieces(self, degree: int) -> Array:
         """Reference corners of the pieces, in order, that are taken as flat: (n, n_corners, d - 1).
@@ -229,8 +224,7 @@ class FacetSet:
 
     def heights(self) -> Array:
         """How far the cells reach below their facets, (n_facets,) (length)."""
-        every = np.arange(len(self.cells))
-        middle, _ = self.positions(every, self._middle.repeat(len(every), axis=0))
+        middle, _ = self.positions(*self._each(self._middle))
         arm = middle[:, None] - self._x[self._nodes][:, :, : self._d]
         depth: Array = np.einsum("fkd,fd->fk", arm, self.mean_normals())
         return depth.max(axis=1, initial=0.0)

@@ -349,7 +349,7 @@ class Pairing:
         """L2 projection, facet by facet, from the pieces' points to the quadrature points."""
         d = self._d
         rows = self._quadrature.point_rows
-        basis = polynomials(d, self._here.simplex, rows.shape[1])
+        basis = polynomials(self._here.kind, rows.shape[1])
         order = np.argsort(facet, kind="stable")
         bounds = np.searchsorted(facet[order], np.arange(len(rows) + 1))
         at_points = tabulate(basis, 0, place)[0, :, :, 0]
@@ -418,6 +418,6 @@ class Pairing:
         found = self._quadrature.degree + degree
         if self._d == 3 and not self._here.simplex:
             n_points = self._quadrature.point_rows.shape[1]
-            own = polynomials(self._d, self._here.simplex, n_points).degree
+            own = polynomials(self._here.kind, n_points).degree
             found = max(found, 2 * (own + max(own, degree)))
         return int(found)

@@ -17,15 +17,12 @@ from fenics_contact.types import Array
 __all__ = ["cut_lines", "cut_polygons", "facing_pairs", "near_pairs", "polynomials"]
 
 
-def polynomials(d: int, simplex: bool, n_points: int) -> Any:
+def polynomials(kind: basix.CellType, n_points: int) -> Any:
     """The largest complete polynomial space on a facet that ``n_points`` points can carry."""
-    cell = basix.CellType.interval if d == 2 else basix.CellType.triangle
-    if d == 3 and not simplex:
-        cell = basix.CellType.quadrilateral
     chosen = None
     for degree in range(n_points):
         element = basix.create_element(
-            basix.ElementFamily.P, cell, degree, basix.LagrangeVariant.legendre, discontinuous=True
+            basix.ElementFamily.P, kind, degree, basix.LagrangeVariant.legendre, discontinuous=True
         )
         if element.dim > n_points:
             break
