@@ -7,7 +7,15 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["check_bool", "check_cells", "check_instance", "is_built_in", "is_number", "listed"]
+__all__ = [
+    "check_bool",
+    "check_cells",
+    "check_instance",
+    "check_positive",
+    "is_built_in",
+    "is_number",
+    "listed",
+]
 
 _CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 
@@ -50,6 +58,28 @@ def is_number(value: Any) -> bool:
     if not isinstance(value, int | float | np.number | np.ndarray):
         return False
     return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
+
+
+def check_positive(
+    name: str,
+    value: Any,
+    what: str = "a number greater than zero",
+    *,
+    infinite: bool = False,
+) -> None:
+    """Refuse what is no positive number.
+
+    Args:
+        name: Of the argument.
+        value: What was given.
+        what: It must be, in words.
+        infinite: Whether it may be infinite.
+
+    Raises:
+        ValueError: It names the argument, what it is, and what it must be.
+    """
+    if not (is_number(value) and value > 0 and (infinite or value < np.inf)):
+        raise ValueError(f"{name} is {value!r}; it must be {what}")
 
 
 def check_instance(name: str, value: Any, kind: type, advice: str = "") -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from fenics_contact.arguments import check_bool, check_instance, is_number
+from fenics_contact.arguments import check_bool, check_instance, check_positive
 from fenics_contact.contact.contact import Contact
 from fenics_contact.joining import JoinedMesh
 from fenics_contact.laws.base import Law
@@ -147,8 +147,7 @@ def _check(
     """Check the arguments."""
     if not callable(law) or isinstance(law, type):
         check_instance("law", law, Law, "or a function of the names of two bodies")
-    if not (is_number(distance) and 0.0 < distance < np.inf):
-        raise ValueError(f"distance is {distance!r}; it must be a length greater than zero")
+    check_positive("distance", distance, "a length greater than zero")
     if bodies is not None and not isinstance(bodies, JoinedMesh | dolfinx.mesh.MeshTags):
         raise ValueError(
             f"bodies is a {type(bodies).__name__}; it must be a JoinedMesh, tags of all cells, or "

@@ -14,7 +14,7 @@ import ufl
 from dolfinx import fem
 from ufl.corealg.traversal import traverse_unique_terminals
 
-from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.arguments import check_instance, check_positive, is_number
 from fenics_contact.contact.accuracy import DEFAULT_FACTOR, Accuracy
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law, Parameters
@@ -318,11 +318,8 @@ class Inputs:
         if self._scale is None:
             return
         if not isinstance(modulus, fem.Function):
-            if not (is_number(modulus) and np.isfinite(modulus) and modulus > 0):
-                raise ValueError(
-                    f"{self._name}: modulus is {modulus!r}; it must be a positive number, or a "
-                    "fem.Function with one value per cell"
-                )
+            what = "a positive number, or a fem.Function with one value per cell"
+            check_positive(f"{self._name}: modulus", modulus, what)
             value = float(modulus)
             modulus = fem.Function(fem.functionspace(self._surface.mesh, ("DG", 0)))
             modulus.x.array[:] = value

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from dolfinx import fem
 
-from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.arguments import check_instance, check_positive
 from fenics_contact.contact.contact import Contact
 from fenics_contact.estimates.errors import ErrorBudget
 from fenics_contact.histories import table
@@ -134,7 +134,6 @@ def report(
             if comm.rank == 0:
                 drawing.pyplot()  # whether it is there
                 files.make_folder(path.parent)
-                tempfile.TemporaryFile(dir=path.parent).close()  # whether it can be written to
                 scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
                 rows = _rows(problem, steps, csv)
         problem.complete()
@@ -212,10 +211,8 @@ def _check(
         raise ValueError(
             f'units is {units!r}; it must be three strings, such as ("mm", "N", "MPa")'
         )
-    if magnification is not None and not (
-        is_number(magnification) and np.isfinite(magnification) and magnification > 0
-    ):
-        raise ValueError(f"magnification is {magnification!r}; it must be a positive number")
+    if magnification is not None:
+        check_positive("magnification", magnification)
 
 
 class _Page:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from numbers import Real
+
+from fenics_contact.arguments import check_positive
 
 __all__ = ["NodalSprings", "RelativeStiffness"]
 
@@ -27,10 +28,8 @@ class RelativeStiffness:
 
     def __post_init__(self) -> None:
         """Check that the factor is a positive number."""
-        if self.factor is None:
-            return
-        if not (isinstance(self.factor, Real) and 0.0 < self.factor < float("inf")):
-            raise ValueError(f"factor is {self.factor!r}; it must be a number greater than zero")
+        if self.factor is not None:
+            check_positive("factor", self.factor)
 
 
 @dataclass(frozen=True)
@@ -52,8 +51,5 @@ class NodalSprings:
 
     def __post_init__(self) -> None:
         """Check that the stiffness is a positive number."""
-        if not (isinstance(self.k, Real) and 0.0 < self.k < float("inf")):
-            raise ValueError(
-                f"k of the NodalSprings is {self.k!r}; it must be a number greater than zero "
-                "(force/length of one node pair)"
-            )
+        what = "a number greater than zero (force/length of one node pair)"
+        check_positive("k of the NodalSprings", self.k, what)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import ufl
 
-from fenics_contact.arguments import is_built_in, is_number
+from fenics_contact.arguments import check_positive, is_built_in, is_number
 from fenics_contact.types import Array
 
 __all__ = [
@@ -389,8 +389,6 @@ def nonzero_vector(name: str, value: Any, gdim: int) -> Any:
 
 def as_positive(name: str, value: Any) -> Any:
     """Check a length given by a number."""
-    if isinstance(value, ufl.core.expr.Expr):
-        return value
-    if not (is_number(value) and np.isfinite(value) and value > 0):
-        raise ValueError(f"{name} is {value!r}; it must be a number greater than zero")
+    if not isinstance(value, ufl.core.expr.Expr):
+        check_positive(name, value)
     return value

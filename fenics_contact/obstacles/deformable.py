@@ -9,7 +9,7 @@ import dolfinx
 import dolfinx.geometry
 import numpy as np
 
-from fenics_contact.arguments import is_number
+from fenics_contact.arguments import check_positive
 from fenics_contact.obstacles.base import Obstacle
 
 __all__ = ["DeformableBody"]
@@ -56,11 +56,8 @@ class DeformableBody(Obstacle):
 
     def __post_init__(self) -> None:
         """Check the arguments."""
-        if not (is_number(self.search_distance) and self.search_distance > 0):
-            raise ValueError(
-                f"search_distance is {self.search_distance!r}; it must be a length greater "
-                "than zero"
-            )
+        length = "a length greater than zero"
+        check_positive("search_distance", self.search_distance, length, infinite=True)
         if self.update_pairs not in ("auto", "never", "increment"):
             raise ValueError(
                 f"update_pairs is {self.update_pairs!r}; use 'auto', 'never' or 'increment'"

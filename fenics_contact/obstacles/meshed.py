@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fenics_contact.arguments import is_number
+from fenics_contact.arguments import check_positive, is_number
 from fenics_contact.obstacles.base import Rotation, Sample, SampledObstacle
 from fenics_contact.obstacles.facets import Facets
 from fenics_contact.obstacles.stl import read_stl
@@ -109,8 +109,7 @@ class RigidSurface(SampledObstacle):
                 neighbouring triangles have opposite orientations.
             OSError: The file cannot be read.
         """
-        if not (is_number(scale) and np.isfinite(scale) and scale > 0):
-            raise ValueError(f"scale is {scale!r}; it must be a number greater than zero")
+        check_positive("scale", scale)
         points, facets = read_stl(Path(path))
         return cls(
             scale * points,

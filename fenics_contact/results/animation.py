@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.arguments import check_instance, check_positive
 from fenics_contact.parallel import collective_errors
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import drawing, files
@@ -72,8 +72,7 @@ class Animation:
         if not isinstance(path, str | os.PathLike) or Path(path).suffix.lower() != ".gif":
             raise ValueError(f"path is {path!r}; it must be the name of a file that ends with .gif")
         for name, value in (("magnification", magnification), ("rate", rate)):
-            if not (is_number(value) and np.isfinite(value) and value > 0):
-                raise ValueError(f"{name} is {value!r}; it must be a positive number")
+            check_positive(name, value)
         drawing.check_view(view)
         self.path, self._problem = Path(path), problem
         self._magnification, self._rate = float(magnification), float(rate)

@@ -14,7 +14,7 @@ import ufl
 from dolfinx import fem
 from dolfinx.mesh import CellType, exterior_facet_indices
 
-from fenics_contact.arguments import check_instance, is_number
+from fenics_contact.arguments import check_instance, check_positive, is_number
 from fenics_contact.compiling import compile_expression
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
@@ -74,8 +74,8 @@ def check_near(near: Any) -> None:
     Raises:
         ValueError: It says what was given.
     """
-    if near is not None and not (is_number(near) and near > 0):
-        raise ValueError(f"near is {near!r}; it must be a length greater than zero")
+    if near is not None:
+        check_positive("near", near, "a length greater than zero", infinite=True)
 
 
 def check_view(view: Any) -> None:
