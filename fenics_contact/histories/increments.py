@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import tempfile
 import weakref
 from collections.abc import Callable, Generator, Iterator, Sequence
 from numbers import Real
@@ -23,6 +22,7 @@ from fenics_contact.histories.table import Table
 from fenics_contact.methods.attempt import Attempt
 from fenics_contact.parallel import collective_errors, global_sum, warn
 from fenics_contact.problem import ContactProblem
+from fenics_contact.results import files
 from fenics_contact.step import Step
 from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
@@ -158,7 +158,7 @@ def increments(
         states.check_places(problem)
     with collective_errors(comm):
         if file is not None and comm.rank == 0:
-            _check_folder(file)
+            files.check_folder("checkpoint", file)
 
     if not isinstance(progress, bool | str):
         raise ValueError(f"progress is {progress!r}; it must be True, False, or a title (str)")
@@ -186,18 +186,6 @@ def increments(
     every = max_cuts, checkpoint_every, recover_interior
     made = _history(problem, apply, leg, file, every, list(state_fields), on_mismatch, table)
     return _Started(made, comm, bar)
-
-
-def _check_folder(checkpoint: Path) -> None:
-    """Refuse a folder that is not there, or where nothing can be written. On the calling rank."""
-    folder = checkpoint.parent
-    if not folder.is_dir():
-        raise ValueError(f"checkpoint is {checkpoint}, but there is no folder {folder}; create it")
-    try:
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as error:
-        words = f"checkpoint is {checkpoint}, but folder {folder} is not writable"
-        raise OSError(f"{words}: {error.strerror}") from error
 
 
 def reads(problem: ContactProblem, constant: fem.Constant) -> bool:

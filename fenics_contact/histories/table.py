@@ -69,11 +69,8 @@ class Table:
                 self._check()
 
     def _check(self) -> None:
-        if not self._path.parent.is_dir():
-            raise ValueError(
-                f"csv is {self._path}, but there is no folder {self._path.parent}; create it"
-            )
         files.check_file(self._path)
+        files.check_folder("csv", self._path)
         there = self._path.exists()
         with open(self._path, "a+", newline="", encoding="utf-8") as file:
             file.seek(0)

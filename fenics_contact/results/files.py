@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["check_file", "make_folder", "replacing"]
+__all__ = ["check_file", "check_folder", "make_folder", "replacing"]
 
 
 def check_file(path: Path) -> None:
@@ -26,12 +27,33 @@ def check_file(path: Path) -> None:
         )
 
 
+def check_folder(name: str, path: Path) -> None:
+    """Refuse a file whose folder is not there, or takes no files. On the calling rank only.
+
+    Args:
+        name: Of the argument that names the file.
+        path: The file.
+
+    Raises:
+        ValueError: There is no such folder.
+        OSError: Nothing can be written to it.
+    """
+    folder = path.parent
+    if not folder.is_dir():
+        raise ValueError(f"{name} is {path}, but there is no folder {folder}; create it")
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        words = f"{name} is {path}, but folder {folder} is not writable"
+        raise OSError(f"{words}: {error.strerror}") from error
+
+
 def make_folder(path: Path) -> None:
-    """Make a folder, and those above it, where they are not there. On the calling rank only.
+    """Make a folder for files, and those above it, if it is not there. On the calling rank only.
 
     Raises:
         NotADirectoryError: Something else has its name, or that of one above it.
-        OSError: It cannot be made.
+        OSError: It cannot be made, or nothing can be written to it.
     """
     there = next((p for p in (path, *path.parents) if p.exists()), None)
     if there is not None and not there.is_dir():
@@ -39,6 +61,7 @@ def make_folder(path: Path) -> None:
             f"{path} must be a folder, but {there} is a file; give another name, or remove it"
         )
     path.mkdir(parents=True, exist_ok=True)
+    tempfile.TemporaryFile(dir=path).close()
 
 
 @contextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -101,7 +100,6 @@ class Writer:
                 files.make_folder(self.folder)
                 for name in ("body", *names):
                     self._series[name] = vtu.read_series(self._path(name))
-                tempfile.TemporaryFile(dir=self.folder).close()  # whether it can be written to
         self._last = -np.inf
 
     def write(self, state: Step | float) -> None:
