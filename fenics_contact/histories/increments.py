@@ -24,6 +24,7 @@ from fenics_contact.parallel import collective_errors, global_sum, warn
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import files
 from fenics_contact.step import Step
+from fenics_contact.surface.dependence import Dependence
 from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
 
@@ -522,26 +523,21 @@ class _Watch:
     def __init__(self, problem: ContactProblem, fields: Sequence[fem.Function]) -> None:
         kept = {id(problem.u), *(id(field) for field in fields)}
         coefficients = problem.full.bulk.form.coefficients()
-        self._functions = [f for f in coefficients if id(f) not in kept]
-        self._values: list[Array] = []
+        self._watched = [(f.name, Dependence([], [f])) for f in coefficients if id(f) not in kept]
         self._comm = problem.u.function_space.mesh.comm
 
     def look(self) -> None:
         """Note the values."""
-        self._values = [f.x.array.copy() for f in self._functions]
+        for _, function in self._watched:
+            function.note()
 
     def compare(self) -> None:
         """Warn, once, of those that have changed since. Collective."""
-        if not self._functions:
-            return
-        pairs = zip(self._functions, self._values, strict=True)
-        changed = [not np.array_equal(f.x.array, values, equal_nan=True) for f, values in pairs]
-        changed = np.any(self._comm.allgather(changed), axis=0)
-        if np.any(changed):
-            names = [
-                f.name for f, is_changed in zip(self._functions, changed, strict=True) if is_changed
-            ]
-            self._functions = []
+        mine = [function.changed for _, function in self._watched]
+        changed = np.any(self._comm.allgather(mine), axis=0)
+        names = [self._watched[i][0] for i in np.flatnonzero(changed)]
+        if names:
+            self._watched = []
             warn(
                 self._comm,
                 f"{', '.join(names)} in the bulk form is changed between increments, but is not "
