@@ -20,6 +20,7 @@ __all__ = [
     "all_finite",
     "collective_errors",
     "fail_together",
+    "gather_on_first",
     "gather_rows",
     "global_max",
     "global_mean",
@@ -166,3 +167,9 @@ def all_finite(comm: MPI.Comm, values: Array) -> bool:
 def gather_rows(comm: MPI.Comm, rows: Array) -> Array:
     """Stack the rows of all ranks, in the order of the ranks, on all ranks. Collective."""
     return np.concatenate(comm.allgather(rows), axis=0)
+
+
+def gather_on_first(comm: MPI.Comm, *rows: npt.NDArray[Any]) -> list[npt.NDArray[Any]] | None:
+    """Stack rows of all ranks as `gather_rows`, on the first; None on the others. Collective."""
+    parts = comm.gather(rows)
+    return None if parts is None else [np.concatenate(part) for part in zip(*parts, strict=True)]

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
+from fenics_contact.parallel import gather_on_first
 from fenics_contact.surface.facets import FacetSet
 from fenics_contact.types import Array, Index, Mask
 
@@ -64,17 +65,16 @@ def along(contact: Contact, unit: str = "mm") -> Along | None:
         "slip": contact.slip.sum(axis=1),
         "status": contact.status,
     }
-    mine = (
+    parts = gather_on_first(
+        contact.surface.mesh.comm,
         facets.moved_corners(None),
         facets.corner_vertices(),
         facets.mean_normals(),
         contact.quadrature.weights[rows].sum(axis=1),
         *(values[rows] for values in fields.values()),
     )
-    gathered = contact.surface.mesh.comm.gather(mine)
-    if gathered is None:
+    if parts is None:
         return None
-    parts = [np.concatenate(part) for part in zip(*gathered, strict=True)]
     ends, vertices, normals, lengths = parts[:4]
     # Facets run with the body on the left, their outward normal on the right.
     edges = ends[:, 1] - ends[:, 0]

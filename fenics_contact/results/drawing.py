@@ -18,7 +18,7 @@ from fenics_contact.arguments import check_instance, check_positive, is_number
 from fenics_contact.compiling import compile_expression
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import global_sum
+from fenics_contact.parallel import gather_on_first, global_sum
 from fenics_contact.results import files
 from fenics_contact.results.obstacles import ObstacleShape, box_about, shapes_of
 from fenics_contact.surface.facets import FacetSet
@@ -176,10 +176,10 @@ class ShapeOf:
         if self._stress is not None and len(self._cells):
             values = np.asarray(self._stress.eval(mesh, self._cells))
             stress = von_mises(values.reshape(-1, 3, 3))
-        gathered = mesh.comm.gather((original, moved, stress))
+        gathered = gather_on_first(mesh.comm, original, moved, stress)
         if gathered is None:
             return None
-        original, moved, stress = (np.concatenate(part) for part in zip(*gathered, strict=True))
+        original, moved, stress = gathered
         return Shape(original, moved, None if self._stress is None else stress)
 
 
@@ -255,13 +255,13 @@ def surface_of(contact: Contact, values: npt.NDArray[Any], magnification: float)
     )
     shape = ShapeOf(u)()
     status = contact.status[contact.quadrature.point_rows]
-    bearing = mesh.comm.gather(np.any(status != Status.OPEN, axis=1))
+    bearing = gather_on_first(mesh.comm, np.any(status != Status.OPEN, axis=1))
     gathered = facets_of(contact, values)
     if gathered is None or bearing is None or shape is None:
         return None
     original, moved, values = gathered
     at = original + magnification * moved
-    return Surface(shape.deformed(magnification), at, values, np.concatenate(bearing), outward)
+    return Surface(shape.deformed(magnification), at, values, bearing[0], outward)
 
 
 def facets_of(
@@ -277,10 +277,10 @@ def facets_of(
     facets = FacetSet(u.function_space, contact.surface.facets)
     original = facets.moved_corners(None)
     mine = original, facets.moved_corners(u) - original, values
-    gathered = contact.surface.mesh.comm.gather(mine)
+    gathered = gather_on_first(contact.surface.mesh.comm, *mine)
     if gathered is None:
         return None
-    original, moved, values = (np.concatenate(part) for part in zip(*gathered, strict=True))
+    original, moved, values = gathered
     return original, moved, values
 
 

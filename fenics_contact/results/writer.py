@@ -20,7 +20,7 @@ from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.compiling import compile_expression
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import collective_errors
+from fenics_contact.parallel import collective_errors, gather_on_first
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import files, vtu
 from fenics_contact.results.drawing import von_mises
@@ -304,14 +304,11 @@ def facet_status(contact: Contact) -> npt.NDArray[np.int8]:
 
 def _gathered(comm: MPI.Comm, grid: vtu.Grid) -> vtu.Grid:
     """The cells of all ranks, one after another, on the first one; else this rank's. Collective."""
-
-    def whole(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        parts = comm.gather(values)
-        return values if parts is None else np.concatenate(parts)
-
-    return replace(
-        grid,
-        points=whole(grid.points),
-        at_nodes={name: whole(values) for name, values in grid.at_nodes.items()},
-        in_cells={name: whole(values) for name, values in grid.in_cells.items()},
-    )
+    rows = grid.points, *grid.at_nodes.values(), *grid.in_cells.values()
+    whole = gather_on_first(comm, *rows)
+    if whole is None:
+        return grid
+    points, *fields = whole
+    at_nodes = dict(zip(grid.at_nodes, fields, strict=False))
+    in_cells = dict(zip(grid.in_cells, fields[len(at_nodes) :], strict=True))
+    return replace(grid, points=points, at_nodes=at_nodes, in_cells=in_cells)
