@@ -26,6 +26,7 @@ __all__ = [
     "Sample",
     "SampledObstacle",
     "ToUFL",
+    "as_axis",
     "as_positive",
     "as_vector",
     "nonzero_vector",
@@ -128,14 +129,8 @@ class Rotation:
         Raises:
             ValueError: ``axis`` is given in the plane, or missing in space.
         """
-        if gdim == 2 and self.axis is not None:
-            raise ValueError(f"axis of the Rotation is {self.axis!r}; omit it in 2D")
-        if gdim == 3 and self.axis is None:
-            raise ValueError("axis of the Rotation is missing; in 3D give its direction")
-        if self.axis is None:
-            return np.array([0.0, 0.0, 1.0])
-        found: Array = nonzero_vector("axis of the Rotation", self.axis, gdim)
-        return found
+        found = as_axis("axis of the Rotation", self.axis, gdim)
+        return np.array([0.0, 0.0, 1.0]) if found is None else np.asarray(found)
 
     def matrix(self, gdim: int, angle: ufl.core.expr.Expr) -> ufl.core.expr.Expr:
         """Return the rotation matrix R, from initial to present directions, (gdim, gdim).
@@ -385,6 +380,15 @@ def nonzero_vector(name: str, value: Any, gdim: int) -> Any:
         value = value / largest  # whose square neither overflows nor vanishes
         return value / np.linalg.norm(value)
     return value
+
+
+def as_axis(name: str, value: Any, gdim: int) -> Any:
+    """Check the direction of an axis: `nonzero_vector` in space, and None in the plane."""
+    if gdim == 2 and value is not None:
+        raise ValueError(f"{name} is {value!r}; omit it in 2D")
+    if gdim == 3 and value is None:
+        raise ValueError(f"{name} is missing; in 3D give its direction")
+    return None if value is None else nonzero_vector(name, value, gdim)
 
 
 def as_positive(name: str, value: Any) -> Any:

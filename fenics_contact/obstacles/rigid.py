@@ -16,6 +16,7 @@ from fenics_contact.obstacles.base import (
     Placement,
     Rotation,
     ToUFL,
+    as_axis,
     as_positive,
     as_vector,
     nonzero_vector,
@@ -129,12 +130,9 @@ class Cylinder(Obstacle):
         gdim = x.ufl_shape[0]
         check_bool("inside of the Cylinder", self.inside)
         arm = x - to_ufl(as_vector("point of the Cylinder", self.point, gdim))
-        if gdim == 2 and self.axis is not None:
-            raise ValueError(f"axis of the Cylinder is {self.axis!r}; omit it in 2D")
-        if gdim == 3:
-            if self.axis is None:
-                raise ValueError("axis of the Cylinder is missing; in 3D give its direction")
-            axis = to_ufl(nonzero_vector("axis of the Cylinder", self.axis, gdim))
+        axis = as_axis("axis of the Cylinder", self.axis, gdim)
+        if axis is not None:
+            axis = to_ufl(axis)
             axis = axis / ufl.sqrt(ufl.dot(axis, axis))
             arm = arm - ufl.dot(arm, axis) * axis
         return _round(arm, to_ufl(as_positive("radius of the Cylinder", self.radius)), self.inside)
