@@ -22,13 +22,12 @@ from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facet_values import facet_values
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import ContactSurface, PointEvaluator, SurfaceQuadrature
+from fenics_contact.tolerances import by_place
 from fenics_contact.types import Array
 
 __all__ = ["PointResults"]
 
 
-# Of coordinates that are compared, by the largest.
-_DIGITS = 9
 # Results that are functions on Γc.
 _FUNCTIONS = ("pressure", "traction", "tangential_traction", "gap", "slip", "normal")
 
@@ -315,8 +314,7 @@ class PointResults(ABC):
             ]
         )
         rows = gather_rows(self.surface.mesh.comm, rows)
-        size = np.abs(rows[:, :d]).max(initial=0.0) or 1.0
-        rows = rows[np.lexsort(np.round(rows[:, :d] / size, _DIGITS).T[::-1])]
+        rows = rows[by_place(rows[:, :d])]
         vectors = {"x": rows[:, :d], "normal": rows[:, d : 2 * d]}
         vectors["tangential_traction"] = rows[:, 2 * d : 3 * d]
         names = ("gap", "pressure", "slip", "status", "measure")

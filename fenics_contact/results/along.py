@@ -13,6 +13,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import gather_on_first
 from fenics_contact.surface.facets import FacetSet
+from fenics_contact.tolerances import by_place
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Along", "along"]
@@ -133,8 +134,7 @@ def _chains(vertices: Index, ends: Array) -> list[tuple[Index, bool]]:
         vertices: Where facets begin and end, by number, (n_facets, 2).
         ends: The same places, (n_facets, 2, 2).
     """
-    size = float(np.abs(ends).max(initial=0.0)) or 1.0
-    order = np.lexsort(np.round(ends[:, 0] / size / _ROUND_OFF).T[::-1])  # whatever ranks have them
+    order = by_place(ends[:, 0])
     leaving: dict[int, list[int]] = {}
     for facet in order[::-1]:
         leaving.setdefault(int(vertices[facet, 0]), []).append(int(facet))

@@ -9,7 +9,7 @@ import scipy.sparse.csgraph
 from dolfinx import fem
 from mpi4py import MPI
 
-from fenics_contact.tolerances import NEGLIGIBLE
+from fenics_contact.tolerances import by_place
 
 __all__ = ["connected_bodies"]
 
@@ -76,9 +76,6 @@ def _ordered(space: fem.FunctionSpace, n: int, body: npt.NDArray[np.intp]) -> np
         np.minimum.at(corner, body, sign * x)
     space.mesh.comm.Allreduce(MPI.IN_PLACE, corners, op=MPI.MIN)
     keys = np.concatenate([corners[0], -corners[1]], axis=1)
-    # Places differ by round-off from one distribution to the other.
-    keys = np.round(keys / (NEGLIGIBLE * (np.abs(keys).max() or 1.0)))
-    order = np.lexsort(keys.T[::-1])
     number = np.empty(n, dtype=np.intp)
-    number[order] = np.arange(n)
+    number[by_place(keys)] = np.arange(n)
     return number[body]

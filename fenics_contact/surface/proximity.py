@@ -17,7 +17,7 @@ from fenics_contact.parallel import gather_rows
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.facets import FacetSet
 from fenics_contact.surface.projection import near_pairs
-from fenics_contact.tolerances import FLAT, NEGLIGIBLE
+from fenics_contact.tolerances import FLAT, NEGLIGIBLE, by_place
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Neighbours", "find_neighbours"]
@@ -236,10 +236,9 @@ def _sides(pairs: Index, middle: Array, *, same: bool) -> tuple[Index, Index]:
     graph = scipy.sparse.coo_matrix((ones, number.T), (len(touched), len(touched))).tocsr()
     side = np.full(len(touched), -1)
     _, group = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    places = middle[touched] / (NEGLIGIBLE * (np.abs(middle[touched]).max() or 1.0))
-    by_place = np.lexsort(np.round(places).T[::-1])
-    _, first = np.unique(group[by_place], return_index=True)
-    for start in by_place[first]:
+    in_order = by_place(middle[touched])
+    _, first = np.unique(group[in_order], return_index=True)
+    for start in in_order[first]:
         order, before = scipy.sparse.csgraph.breadth_first_order(graph, start, directed=False)
         side[start] = 0
         for node in order[1:]:
