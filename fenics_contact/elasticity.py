@@ -75,9 +75,7 @@ class LinearElastic:
             across = -self.nu / (1 - self.nu) * ufl.tr(epsilon)
         elif self.kind == "axisymmetric":
             across = w[0] / ufl.SpatialCoordinate(_mesh(self.u))[0]
-        return ufl.as_tensor(
-            [[epsilon[0, 0], epsilon[0, 1], 0], [epsilon[1, 0], epsilon[1, 1], 0], [0, 0, across]]
-        )
+        return _in_space(epsilon, across)
 
     def stress_of(self, w: Any) -> Any:
         """Return the stress σ(w) of a displacement w, shape (3, 3) (UFL)."""
@@ -202,9 +200,7 @@ class NeoHookean:
         across: Any = ufl.as_ufl(0.0)
         if self.kind == "axisymmetric":
             across = w[0] / ufl.SpatialCoordinate(_mesh(self.u))[0]
-        return ufl.as_tensor(
-            [[slope[0, 0], slope[0, 1], 0], [slope[1, 0], slope[1, 1], 0], [0, 0, across]]
-        )
+        return _in_space(slope, across)
 
     def residual(self, v: Any, dx: ufl.Measure = ufl.dx, *, q: Any = None) -> ufl.Form:
         """Return the virtual work of the stresses, ∫ P:grad v weight dx.
@@ -242,6 +238,13 @@ def _check_kind(u: fem.Function, kind: str, kinds: list[str]) -> None:
             f"u has shape {u.ufl_shape} on a mesh in {gdim}D; a body of kind {kind!r} has "
             f"({KINDS[kind]},) in {KINDS[kind]}D"
         )
+
+
+def _in_space(plane: Any, across: Any) -> Any:
+    """The tensor (3, 3) of one in the plane, with a component across it."""
+    return ufl.as_tensor(
+        [[plane[0, 0], plane[0, 1], 0], [plane[1, 0], plane[1, 1], 0], [0, 0, across]]
+    )
 
 
 def _mesh(u: Any) -> Any:

@@ -4,10 +4,6 @@ A law maps the kinematics at a point of Γc (`PointKinematics`) to the tractions
 (`ContactTraction`), in two and three dimensions and for every obstacle. The traction on the body is
 r_n n + τ, with n from the body to the obstacle and r_n ≤ 0 (> 0 only with `Foundation`). Equation
 numbers (n) are those of docs/formulation.md, and [n] those of the source paper.
-
-A user-defined law is a subclass of `Law`, or of `FrictionLaw` with friction, and a dataclass of its
-parameters. It defines `Law.contact_traction`; `Law.normal_potential`, if r_n is not -k_n δ₋ with a
-parameter "k_n"; and `Law.positive`, the parameters that must not vanish.
 """
 
 from __future__ import annotations
@@ -100,9 +96,10 @@ class Parameters(dict[str, Any]):
 class Law:
     """Base class of contact laws: tractions as a function of the local kinematics, in UFL.
 
-    A subclass is a dataclass whose fields are the law's parameters. It defines `contact_traction`,
-    and `normal_potential` unless r_n = -k_n δ₋ with a parameter ``k_n``. The defaults of all other
-    members are those of frictionless unilateral contact.
+    A subclass, with friction one of `FrictionLaw`, is a dataclass whose fields are the law's
+    parameters. It defines `contact_traction`, `normal_potential` unless r_n = -k_n δ₋ with a
+    parameter ``k_n``, and `positive`, the parameters that must not vanish. The defaults of all
+    other members are those of frictionless unilateral contact.
     """
 
     @property
