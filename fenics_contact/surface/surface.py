@@ -381,6 +381,7 @@ class SurfaceQuadrature:
         self._cell = surface.submesh.topology.cell_name()
         self.at_vertices = scheme == "vertex"
         self._points_and_weights = _vertex_rule(self._cell) if self.at_vertices else None
+        self._spaces: dict[int | None, fem.FunctionSpace] = {}
         space = self.space()
         self.weights_with_ghosts = self._weigh(self.ds)
         self.n_points = space.dofmap.index_map.size_local
@@ -404,14 +405,20 @@ class SurfaceQuadrature:
         return 2 * max(1, element_degree)
 
     def space(self, size: int | None = None) -> fem.FunctionSpace:
-        """Space of functions at the quadrature points, scalar or with ``size`` components."""
-        shape = () if size is None else (size,)
-        points, weights = self._points_and_weights or (None, None)
-        with printed_as_ever():
-            element = basix.ufl.quadrature_element(
-                self._cell, value_shape=shape, points=points, weights=weights, degree=self.degree
-            )
-        return fem.functionspace(self.surface.submesh, element)
+        """Space of functions at the points, scalar or with ``size`` components, made once."""
+        if size not in self._spaces:
+            shape = () if size is None else (size,)
+            points, weights = self._points_and_weights or (None, None)
+            with printed_as_ever():
+                element = basix.ufl.quadrature_element(
+                    self._cell,
+                    value_shape=shape,
+                    points=points,
+                    weights=weights,
+                    degree=self.degree,
+                )
+            self._spaces[size] = fem.functionspace(self.surface.submesh, element)
+        return self._spaces[size]
 
     @cached_property
     def point_rows(self) -> npt.NDArray[np.int32]:
