@@ -64,13 +64,9 @@ class Judge:
         self._warned: dict[str, float] = {}
         self._inexact: set[str] = set()
         self._few: set[tuple[str, str]] = set()
-        space = full.displacement.u.function_space
-        gdim = space.mesh.geometry.dim
-        n_nodes = space.dofmap.index_map.size_global
         products = np.einsum("bmi,bni->bmn", motions.of_bodies, motions.of_bodies)
         # A body of one node has no rotations.
         self._inverse = np.linalg.pinv(global_sum(self._comm, products), hermitian=True)
-        self._cell_size = full.scales.mesh_size / n_nodes ** (1 / gdim)
 
     def judge(
         self,

@@ -250,7 +250,8 @@ class ObstaclePaths:
         depth = -dot(points - surface.corner[through], surface.normal[through])
         rows = np.flatnonzero((through >= 0) & (depth > surface.allowed[through]))
         normal = surface.normal[through[rows]]
-        depth, facet = surface.depth(points[rows], normal, 2 * depth[rows])
+        reach = 2 * depth[rows]
+        depth, facet = depth_below_surface(self.comm, points[rows], normal, reach, surface.facets)
         deep = (facet >= 0) & (depth > surface.allowed[facet])
         deep &= ~surface.is_shallow(points[rows], normal)
         return np.asarray(surface.middle[np.unique(facet[deep])])

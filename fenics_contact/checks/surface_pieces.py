@@ -60,10 +60,6 @@ class SurfacePieces:
         table = gather_rows(comm, table)
         return cls(comm, facets, table[:, 0], *np.split(table[:, 1:], 3, axis=1))
 
-    def depth(self, points: Array, outward: Array, reach: Array) -> tuple[Array, Index]:
-        """See `depth_below_surface`. Collective."""
-        return depth_below_surface(self.comm, points, outward, reach, self.facets)
-
     def is_shallow(self, points: Array, normal: Array) -> Mask:
         """Find points that are no deeper below another face than is allowed there. Collective.
 
@@ -79,7 +75,8 @@ class SurfacePieces:
         cosine = normal @ self.normal.T
         row, facet = np.nonzero(near & (cosine > OPPOSITE_SIDES) & (cosine < _EDGE))
         reach = 2 * depth[row, facet] + DEPTH_RESOLUTION * self.allowed[facet]
-        _, met = self.depth(points[row], self.normal[facet], reach)
+        outward = self.normal[facet]
+        _, met = depth_below_surface(self.comm, points[row], outward, reach, self.facets)
         found = np.zeros(len(points), dtype=np.bool_)
         found[row[met == facet]] = True
         return found

@@ -108,8 +108,7 @@ class Parts:
 
     Attributes:
         names: Of the parts.
-        label: Body or free obstacle of every unknown of this rank, (n_local,).
-        n_bodies: Their number.
+        n_bodies: Number of bodies and free obstacles.
     """
 
     def __init__(
@@ -127,7 +126,7 @@ class Parts:
 
         Args:
             comm: The ranks.
-            label: See the attribute.
+            label: Body or free obstacle of every unknown of this rank, (n_local,).
             bodies: Names of bodies, then of free obstacles.
             contacts: Names of the contacts.
             touched: Unknowns of this rank that a contact feels or acts on, for every contact.
@@ -136,7 +135,7 @@ class Parts:
             scales: Reference scales of the bodies.
             motions: Of every free obstacle the number of its contact.
         """
-        self._comm, self.label, self._touched = comm, label, touched
+        self._comm, self._touched = comm, touched
         self.n_bodies = len(bodies)
         self._bodies: Labels | int = label if len(bodies) > 1 else 0
         self.names = [*bodies, *contacts]

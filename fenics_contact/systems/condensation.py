@@ -185,17 +185,12 @@ class Condensation:
         """Drop the solutions for earlier loads."""
         self.directions = []
 
-    def recover(self, kept: Array, particular: Array) -> Array:
-        """All unknowns, (n_local,). Collective.
+    def extended(self, kept: Array) -> Array:
+        """All unknowns without load, (n_local,), that follow from those kept. Collective.
 
         Args:
-            kept: Those kept, on the first rank, (n_kept,).
-            particular: The displacement with these at rest, (n_local,); see `ParticularSolution`.
+            kept: On the first rank, (n_kept,).
         """
-        return particular + self.extended(kept)
-
-    def extended(self, kept: Array) -> Array:
-        """All unknowns without load, (n_local,), that follow from those kept. Collective."""
         own, result = self._piece, np.zeros(self._right.getLocalSize())
         boundary, result[own.interface] = self._interface.carried(kept)
         state = self._dissection.complete(boundary)

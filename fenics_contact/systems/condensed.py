@@ -129,7 +129,7 @@ class CondensedSystem(System):
         )
         self.mark = object()
         self.ready = True
-        self._full.take_diagonal(stiffness)
+        self._full.diagonal = self._full.bulk_diagonal()
         return 1
 
     @property
@@ -179,7 +179,7 @@ class CondensedSystem(System):
     def complete(self, field: Array | None) -> None:
         """One back-substitution for the unknowns eliminated."""
         assert field is not None
-        self._full.set_state(self.condensation.recover(self.state(), field))
+        self._full.set_state(field + self.condensation.extended(self.state()))
 
     def bulk_force(self) -> Array:
         """S x - g: the residual of the bulk and of free obstacles."""
@@ -213,8 +213,7 @@ class CondensedSystem(System):
         if self._condensation is not None:
             self._condensation.forget()
             # As `update` leaves it, also at unknowns that no matrix of contact has.
-            assert self._full.stiffness is not None
-            self._full.take_diagonal(self._full.stiffness)
+            self._full.diagonal = self._full.bulk_diagonal()
 
     def matrix(self, *, symmetric: bool) -> PETSc.Mat:
         """A new operator, S and contact side by side."""
@@ -252,7 +251,7 @@ class CondensedSystem(System):
         added = np.bincount(rows[on], values[on], minlength=len(fixed))
         self.diagonal = self.bulk_diagonal() + scale * added
         # For the round-off of contact.
-        self._full.change_diagonal(self.unknowns.kept, self.unknowns.scattered(self.diagonal))
+        self._full.diagonal[self.unknowns.kept] = self.unknowns.scattered(self.diagonal)
         return 0
 
 

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from fenics_contact.parallel import global_sum
-from fenics_contact.systems.balance import MOST_EXCUSED, InitialForces, by_body
+from fenics_contact.systems.balance import MOST_EXCUSED, InitialForces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.least_motion import find_least_motion
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
-from fenics_contact.tolerances import FLAT
+from fenics_contact.tolerances import FLAT, ROUND_OFF
 from fenics_contact.types import Array, Mask
 
 __all__ = ["find_ejected_bodies"]
@@ -49,13 +49,14 @@ def find_ejected_bodies(
         displacement nearby, change of its shape or of contact springs, or least motion (length).
     """
     scales, n = full.scales, full.scales.n_bodies
-    loose = motions.unconstrained_bodies()
+    loose = ~scales.held[:n]
     if not loose.any():
         return {}
     # What has a load is not in equilibrium, and may be on its way to be set down.
-    forces = by_body(full.unknowns.comm, [*contacts, full.load], full.label, full.n_bodies)
+    forces = full.by_body(*contacts, full.load)
     force, committed = (each.sum(axis=0)[:n] for each in (forces, start.pushes))
-    unloaded = loose & (scales.is_unloaded(force) | (force <= MOST_EXCUSED * committed))
+    idle = (force <= ROUND_OFF * scales.force) | (force <= MOST_EXCUSED * committed)
+    unloaded = loose & idle
     if not unloaded.any():
         return {}
     change, bodies = full.state() - began, motions.of_bodies[:, : full.gdim]

@@ -21,7 +21,7 @@ from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Unknowns
-from fenics_contact.types import Array, Indices, Mask
+from fenics_contact.types import Array, Mask
 
 __all__ = ["FullSystem"]
 
@@ -314,7 +314,7 @@ class FullSystem(System):
         rows = (start + np.flatnonzero(self.constrained)).astype(PETSc.IntType)
         scale = self.bulk.scale
         # Before the conditions, whose rows are as large as the stiffest body's.
-        self.take_diagonal(matrix)
+        self.diagonal = _diagonal(matrix)
         matrix.zeroRowsColumns(rows, diag=scale)
         matrix.scale(1.0 / scale)
         return int(self.linear_kind == "direct")
@@ -323,14 +323,6 @@ class FullSystem(System):
         """See `System.bulk_diagonal`."""
         assert self.stiffness is not None
         return _diagonal(self.stiffness)
-
-    def take_diagonal(self, matrix: PETSc.Mat) -> None:
-        """Let the diagonal be that of a matrix on all unknowns. Collective."""
-        self.diagonal = _diagonal(matrix)
-
-    def change_diagonal(self, dofs: Indices, values: Array) -> None:
-        """Let a part of the diagonal be another."""
-        self.diagonal[dofs] = values
 
 
 def _diagonal(matrix: PETSc.Mat) -> Array:

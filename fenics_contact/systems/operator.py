@@ -212,8 +212,10 @@ class ContactOperator:
             A new matrix over the unknowns (force/length).
         """
         tangent = tangent or self.contact.acting.tangent()
-        if self.contact.opposite.local_map is not None:
-            return self._local_tangent(tangent.by_jump, self.contact.opposite.local_map)
+        local = self.contact.opposite.local_map
+        if local is not None:  # of pairs that follow the bodies; see `PresentPairs.tangent`
+            lifted = self.unknowns.widened(self.contact.displacement.lifted(local))
+            return self._sandwiched(-self.contact.area[:, None, None] * tangent.by_jump, lifted)
         if tangent.spun is not None and self._turn is not None:
             product = self.springs(-tangent.by_jump)
             self._add_spin(product, tangent.spun, self._turn)
@@ -230,11 +232,6 @@ class ContactOperator:
         for item in (jumps, shifts, right, turned):
             item.destroy()
         return product
-
-    def _local_tangent(self, by_local: Array, local_map: PETSc.Mat) -> PETSc.Mat:
-        """Of pairs that follow the bodies; see `PresentPairs.tangent`. Collective."""
-        lifted = self.unknowns.widened(self.contact.displacement.lifted(local_map))
-        return self._sandwiched(-self.contact.area[:, None, None] * by_local, lifted)
 
     # ---- an obstacle that is turned by a moment --------------------------------------------------
 

@@ -179,10 +179,6 @@ class ReferenceScales:
         graph = scipy.sparse.coo_matrix((np.ones(len(links)), links.T), (n, n))
         _, self.group = scipy.sparse.csgraph.connected_components(graph, directed=False)
 
-    def is_unloaded(self, force: Array) -> Mask:
-        """Which bodies bear no force but round-off, by the norms of the forces on each."""
-        return np.asarray(force <= ROUND_OFF * self.force)
-
     @property
     def round_off_of_groups(self) -> Array:
         """Force on a group of coupled parts that is round-off, of its softest body, (n_groups,)."""

@@ -38,6 +38,7 @@ class RigidBodyModes:
             multiplied to be one of order one (length); 0 for the others.
         of_bodies: Their fields at this rank's unknowns, (n_bodies, n_per_body, n_local).
         free: Coefficients of the free motions, shape (n_free, n_motions).
+        fields: Their fields at this rank's unknowns, of the undeformed bodies, (n_free, n_local).
     """
 
     def __init__(
@@ -85,8 +86,7 @@ class RigidBodyModes:
         shape = n_bodies, n_modes // n_bodies, unknowns.n_local
         self.of_bodies = self._modes[:n_modes].reshape(shape)
         self.free: Array = np.zeros((0, n_modes))
-        self._free_fields: Array = np.zeros((0, unknowns.n_local))
-        self._free_sizes = self._free_fields  # of their entries
+        self.fields: Array = np.zeros((0, unknowns.n_local))
         # Masks of points that were found to hold all motions, and of which contacts.
         self._holding: list[Mask] = []
         self._holders: weakref.WeakSet[ContactOperator] = weakref.WeakSet()
@@ -137,8 +137,7 @@ class RigidBodyModes:
         self._jumps.clear()
         self.free = _plain(free.T)
         self._scales.held = np.all(~np.hstack(self._moved()), axis=0)
-        self._free_fields = self.free @ self._modes
-        self._free_sizes = np.abs(self._free_fields)
+        self.fields = self.free @ self._modes
         self._holding = []
         for vector in (work, image):
             vector.destroy()
@@ -150,11 +149,6 @@ class RigidBodyModes:
             found = [operator.jump(c @ self._modes) for c in self.free]
             self._jumps[operator] = np.array(found).reshape(len(self.free), n_points, gdim)
         return self._jumps[operator]
-
-    @property
-    def fields(self) -> Array:
-        """The free motions at this rank's unknowns, of the undeformed bodies, (n_free, n_local)."""
-        return self._free_fields
 
     def _moved(self) -> tuple[Mask, Mask]:
         """Which bodies every free motion moves, (n_free, n_bodies), and which obstacles."""
@@ -172,11 +166,6 @@ class RigidBodyModes:
         """Which of the free motions are not those of obstacles alone, (n_free,)."""
         bodies, _ = self._moved()
         return np.asarray(bodies.any(axis=1))
-
-    def unconstrained_bodies(self) -> Mask:
-        """Which bodies a free motion moves, (n_bodies,)."""
-        bodies, _ = self._moved()
-        return np.asarray(bodies.any(axis=0))
 
     def of_bodies_alone(self, bodies: Mask) -> Index:
         """Numbers of the free motions that move some of these bodies and nothing else."""
@@ -222,7 +211,7 @@ class RigidBodyModes:
         return np.asarray(of_each.reshape(n_bodies, n_motions).sum(axis=1))
 
     def present_fields(self) -> Array:
-        """The same of the bodies where they are now, about the same centres."""
+        """`fields` of the bodies where they are now, about the same centres, (n_free, n_local)."""
         return np.asarray(self.free @ self._modes_at(self._places()), dtype=np.float64)
 
     def _places(self) -> Array:
@@ -509,30 +498,25 @@ class RigidBodyModes:
 
     def generalised_forces(self, forces: Array) -> Array:
         """Work of forces at this rank's unknowns on the free motions, (n_free,). Collective."""
-        return global_sum(self.comm, self._free_fields @ forces)
-
-    def resultants(self, forces: Array) -> Array:
-        """`generalised_forces` of forces at this rank's unknowns. Collective.
-
-        But for those by which obstacles turn: what presses may have no moment.
-        """
-        return self.generalised_forces(forces)[self.straight()]
+        return global_sum(self.comm, self.fields @ forces)
 
     def load_resultant(
         self, load: Array, operators: Sequence[ContactOperator]
     ) -> tuple[Array, Array]:
-        """`resultants` of a load and of normal tractions that a law prescribes. Collective.
+        """Work of a load and of normal tractions that a law prescribes on the free motions.
+
+        But for those by which obstacles turn: what presses may have no moment. Collective.
 
         Args:
             load: External forces at this rank's unknowns (force).
             operators: Of evaluated contacts, over all unknowns.
 
         Returns:
-            Them, 0 where they are round-off, and what the load could do at most, were all of it
+            It, 0 where it is round-off, and what the load could do at most, were all of it
             along the mode: (n_straight,) (force).
         """
         rows = self.straight()
-        sums = np.stack([self._free_fields @ load, self._free_sizes @ np.abs(load)])[:, rows]
+        sums = np.stack([self.fields @ load, np.abs(self.fields) @ np.abs(load)])[:, rows]
         for operator in operators:
             contact = operator.contact
             if not contact.law.has_normal_stiffness:
@@ -549,7 +533,7 @@ class RigidBodyModes:
         return np.asarray(self._scales.group[np.argmax(np.hstack(self._moved()), axis=1)])
 
     def generalised_load(self, load: Array) -> Array:
-        """The largest of the `resultants` of a load, by size, (n_groups,) (force). Collective."""
+        """The largest `load_resultant` of a load, by size, (n_groups,) (force). Collective."""
         largest: Array = np.zeros(self._scales.n_groups)
         resultants = self.load_resultant(load, ())[0]
         np.maximum.at(largest, self.groups()[self.straight()], np.abs(resultants))
