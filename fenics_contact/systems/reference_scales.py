@@ -48,8 +48,6 @@ class ReferenceScales:
         group: Number of the group of coupled parts that a part belongs to, (n_parts,).
         touching: Which bodies a contact touches, with the pairs at the start of the increment,
             (n_contacts, n_bodies).
-        sides: Of every contact the parts on both sides of this rank's points, with these pairs,
-            (n_points,) each; the same twice where the obstacle is rigid, or nothing is opposite.
         held: Which parts Dirichlet conditions, or springs of the bulk, hold against every rigid
             motion, (n_parts,).
     """
@@ -100,7 +98,6 @@ class ReferenceScales:
         self._turning = n_bodies + np.flatnonzero(turns)
         self.held: Mask = np.ones(n_bodies + n_motions, dtype=np.bool_)
         self._own = [body_of_points(contact, space, body) for contact in contacts]
-        self.sides: list[tuple[Index, Index]] = []
         self._coupled: list[int] | None = None  # numbers of the pairs whose coupling was found
 
     @property
@@ -160,19 +157,13 @@ class ReferenceScales:
         Args:
             operators: Of the contacts, over all unknowns, at the start of an increment.
         """
-        if self._coupled != (coupled := [o.contact.pairs.number for o in operators]):
-            self._coupled = coupled
-            self._couple(operators)
-
-    def _couple(self, operators: Sequence[ContactOperator]) -> None:
-        """Find which parts the pairs of the contacts couple. Collective."""
-        n, self.sides = len(self.group), []
+        if self._coupled == (coupled := [o.contact.pairs.number for o in operators]):
+            return
+        self._coupled, n = coupled, len(self.group)
         self.touching = np.zeros((len(operators), self.n_bodies), dtype=np.bool_)
         every: list[Any] = [np.zeros((0, 2), dtype=np.intp)]
         for number, operator in enumerate(operators):
-            own, opposite = self._sides(operator, number, self.label)
-            self.sides.append((own, opposite[:, 0]))
-            pairs = self._pairs(own, opposite, number)
+            pairs = self.pairs(operator, number, self.label)
             self.touching[number, pairs[pairs < self.n_bodies]] = True
             every.append(pairs)
         links = np.concatenate(every)
@@ -253,27 +244,14 @@ class ReferenceScales:
             number: Of the contact.
             label: Part of each of these unknowns.
         """
-        return self._pairs(*self._sides(operator, number, label), number)
-
-    def _pairs(self, own: Index, opposite: Index, number: int) -> Index:
-        """`pairs` of what `_sides` gave. Collective."""
-        others = [*opposite.T, *(np.full_like(own, m) for m in self._motions[number])]
-        n = len(self.group)
-        mine = np.unique(np.concatenate([n * own + other for other in others]))
-        return np.column_stack(divmod(np.unique(np.concatenate(self._comm.allgather(mine))), n))
-
-    def _sides(self, operator: ContactOperator, number: int, label: Index) -> tuple[Index, Index]:
-        """The part on both sides of each of this rank's points. Collective.
-
-        Returns:
-            That with Γc, (n_points,), and by component what lies opposite, or the same where that
-            is rigid, (n_points, gdim).
-        """
-        own = self._own[number]
+        own, n = self._own[number], len(self.group)
         # Of the number of the part as a displacement a jump is the difference of both sides.
         jump = operator.jump(np.where(np.isin(label, self._turning), 0.0, label + 1.0))
-        other = np.rint(own[:, None] + 1 - jump).astype(np.intp) - 1
-        return own, np.where(other < 0, own[:, None], other)
+        opposite = np.rint(own[:, None] + 1 - jump).astype(np.intp) - 1
+        opposite = np.where(opposite < 0, own[:, None], opposite)
+        others = [*opposite.T, *(np.full_like(own, m) for m in self._motions[number])]
+        mine = np.unique(np.concatenate([n * own + other for other in others]))
+        return np.column_stack(divmod(np.unique(np.concatenate(self._comm.allgather(mine))), n))
 
 
 def body_of_points(contact: Contact, space: fem.FunctionSpace, body: npt.NDArray[np.intp]) -> Index:
