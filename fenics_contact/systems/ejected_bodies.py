@@ -69,11 +69,11 @@ def find_ejected_bodies(
     shift = np.where(unloaded[:, None], translation, 0.0)
     other = change - np.where(full.constrained, 0.0, np.einsum("bd,bdi->i", shift, bodies))
     largest = scales.largest(np.where(np.any(bodies != 0.0, axis=(0, 1)), other, 0.0))
-    obstacles = np.maximum(_obstacle_displacements(full, change), _spring_lengths(full))
-    around = np.where(unloaded, obstacles, np.maximum(largest, obstacles))
-    nearby = np.maximum(largest, obstacles)
-    for body in np.flatnonzero(unloaded):
-        nearby[body] = around[scales.coupled_with(int(body))].max(initial=nearby[body])
+    opposite = _moved_opposite(full, change)
+    around: Array = np.zeros(scales.n_groups)
+    group = scales.group[:n]
+    np.maximum.at(around, group, np.where(unloaded, opposite, np.maximum(largest, opposite)))
+    nearby = np.maximum(largest, around[group])
     way, least = np.linalg.norm(translation, axis=1), FLAT * scales.size
     if not np.any(unloaded & (way > np.maximum(_MAX_RATIO * nearby, least))):
         return {}
@@ -111,25 +111,12 @@ def _pushed(full: FullSystem, motions: RigidBodyModes, bodies: Mask, began: Arra
     return motions.size_by_body(nothing if least is None else least)
 
 
-def _spring_lengths(full: FullSystem) -> Array:
-    """Largest change of length of the contact springs at the last commit, (n_bodies,) (length).
+def _moved_opposite(full: FullSystem, change: Array) -> Array:
+    """How far contact may have moved every body at most, at its points, (n_bodies,) (length).
 
-    A body that they are let go with springs back by it: one pulled by a bond, too. Collective.
-    """
-    found: Array = np.zeros(full.scales.n_bodies)
-    for number, contact in enumerate(full.contacts):
-        points = contact.states.committed.points
-        none = np.zeros(contact.quadrature.n_points)
-        bore = none if points is None else np.where(points.normal_traction != 0, points.gap, 0.0)
-        lengths = np.abs(np.where(np.isfinite(bore), bore, 0.0))
-        found = np.maximum(found, full.scales.largest_at_points(number, lengths))
-    return found
-
-
-def _obstacle_displacements(full: FullSystem, change: Array) -> Array:
-    """Largest displacement of rigid obstacles at the points of every body, (n_bodies,) (length).
-
-    Since the last commit: that of the body minus that relative to the obstacle. Collective.
+    By rigid obstacles their displacement since the last commit: that of the body minus that
+    relative to the obstacle. By contact springs their change of length at that commit: a body that
+    they are let go with springs back by it, one pulled by a bond, too. Collective.
 
     Args:
         full: The system at its present state.
@@ -140,11 +127,15 @@ def _obstacle_displacements(full: FullSystem, change: Array) -> Array:
     of_bodies = np.where(full.label < scales.n_bodies, change, 0.0)
     for number, operator in enumerate(full.operators):
         contact, opposite = operator.contact, operator.contact.opposite
+        length: Array = np.zeros(contact.quadrature.n_points)
+        if (points := contact.states.committed.points) is not None:
+            bore = (points.normal_traction != 0) & np.isfinite(points.gap)
+            length[bore] = np.abs(points.gap[bore])
         if opposite.is_rigid:
             # Within an iteration the values of the contact may be those of another state.
             opposite.update()
             relative = contact.acting.own.evaluate()["jump"] - opposite.committed_jump
             displacement = operator.jump(of_bodies) - opposite.turned(relative)
-            length = np.linalg.norm(displacement, axis=1)
-            found = np.maximum(found, scales.largest_at_points(number, length))
+            length = np.maximum(length, np.linalg.norm(displacement, axis=1))
+        found = np.maximum(found, scales.largest_at_points(number, length))
     return found

@@ -209,12 +209,6 @@ class ReferenceScales:
         """Sum over all ranks. Collective."""
         return global_sum(self._comm, values)
 
-    def coupled_with(self, body: int) -> Mask:
-        """Which other bodies may exchange forces with a body in this increment, (n_bodies,)."""
-        others = self.group[: self.n_bodies] == self.group[body]
-        others[body] = False
-        return others
-
     def group_of_points(self, number: int) -> Index:
         """Groups of the bodies with this rank's points of a contact, by its number, (n_points,)."""
         return np.asarray(self.group[self._own[number]])
