@@ -292,6 +292,16 @@ def test_pressures_have_a_unit_by_which_their_equations_are_forces():
         assert np.abs(problem.full.bulk.assemble_residual() - expected).max(initial=0.0) < 1e-12 * E
 
 
+def test_pressures_that_change_displace_no_body():
+    """Bodies are compared by their displacements, in the unit of which these are."""
+    scene = rubber("triangle", n=(4, 2), mixed="Taylor-Hood", nu=0.5)
+    problem, _ = scene.problem(disc(scene, 0.8), fc.Frictionless(1e4))
+    full, ((_, pressures),) = problem.full, problem.displacement.others
+    for dofs, expected in ((pressures, 0.0), (problem.displacement.dofs, 2.0)):
+        scene.u.x.array[dofs] = -2.0
+        assert full.scales.largest(full.state()).tolist() == [expected]
+
+
 def test_the_stiffness_of_springs_follows_the_shear_modulus():
     """E of a mixed form is 3 G, that of an incompressible body, whatever ν: 1e-9."""
     for nu in (0.3, 0.5):

@@ -185,8 +185,7 @@ class Judge:
         full, scales, motions = self._full, self._full.scales, self._motions.of_bodies
         state = full.state()
         rigid = np.einsum("bmn,bn->bm", self._inverse, global_sum(self._comm, motions @ state))
-        moves = np.any(motions != 0.0, axis=(0, 1))
-        rest = scales.largest(np.where(moves, state - np.einsum("bm,bmi->i", rigid, motions), 0.0))
+        rest = scales.largest(state - np.einsum("bm,bmi->i", rigid, motions))
         spread: Array = np.zeros(len(motions))
         for along in np.swapaxes(motions[:, : full.gdim], 0, 1):
             held = np.any(along != 0.0, axis=0) & full.constrained

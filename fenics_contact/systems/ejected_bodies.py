@@ -68,7 +68,7 @@ def find_ejected_bodies(
     # Of an unloaded body the change of its shape, its rotation, and what is prescribed.
     shift = np.where(unloaded[:, None], translation, 0.0)
     other = change - np.where(full.constrained, 0.0, np.einsum("bd,bdi->i", shift, bodies))
-    largest = scales.largest(np.where(np.any(bodies != 0.0, axis=(0, 1)), other, 0.0))
+    largest = scales.largest(other)
     opposite = _moved_opposite(full, change)
     around: Array = np.zeros(scales.n_groups)
     group = scales.group[:n]

@@ -112,7 +112,7 @@ class ReferenceScales:
             stiffness: Over all unknowns, without conditions.
         """
         diagonal = stiffness.getDiagonal()
-        entries = np.where(self._moves, diagonal.array_r, 0.0)
+        entries = diagonal.array_r.copy()
         diagonal.destroy()
         largest = self.largest(entries)
         inverse = self.largest(1.0 / np.where(entries > 0.0, entries, np.inf))
@@ -120,9 +120,13 @@ class ReferenceScales:
         self.least_force = self.size / np.where(inverse > 0, inverse, np.inf)
 
     def largest(self, values: Array) -> Array:
-        """Largest absolute value of every body, at its unknowns, (n_bodies,). Collective."""
+        """Largest absolute value of every body, at its displacements, (n_bodies,). Collective.
+
+        Args:
+            values: At this rank's unknowns; those at others, such as pressures, do not count.
+        """
         found: Array = np.zeros(len(self.group))
-        np.maximum.at(found, self.label, np.abs(values))
+        np.maximum.at(found, self.label[self._moves], np.abs(values[self._moves]))
         self._comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
         return found[: self.n_bodies]
 
