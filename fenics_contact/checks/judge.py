@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from fenics_contact.arguments import check_bool
 from fenics_contact.checks.cross_check import CrossCheck
-from fenics_contact.checks.kinematics import Linearisation, linearisation
+from fenics_contact.checks.kinematics import Respond, linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.quadrature_resolution import warn_of_divided_facets, warn_of_few_points
 from fenics_contact.checks.tunnelling import TunnellingCheck
@@ -23,11 +23,7 @@ from fenics_contact.systems.system import System
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array
 
-__all__ = ["Judge", "Respond"]
-
-# The change of the relative displacements at the points of every contact by springs there and by
-# tractions added on the body.
-Respond = Callable[[Sequence[Array], Sequence[Array]], Sequence[Array]]
+__all__ = ["Judge"]
 
 # Growth of what small displacements leave out from which on it is said again.
 _AGAIN = 2.0
@@ -126,7 +122,9 @@ class Judge:
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
             obstacles={c.name: ObstacleCheck.of(c) for c in self._contacts if laws and c.rigid},
             tunnelling=tunnelling,
-            small_displacement_error=self._linearisation(respond) if respond else {},
+            small_displacement_error=(
+                linearisation(self._contacts, self._full.scales, respond) if respond else {}
+            ),
             small_displacement_tolerance=self.small_displacement_tolerance,
             deformation=self._deformation(),
             ejected_bodies=ejected,
@@ -167,15 +165,6 @@ class Judge:
                 told = contact.name, say.__name__
                 if told not in self._few and say(contact):
                     self._few.add(told)
-
-    def _linearisation(self, respond: Respond) -> dict[str, Linearisation]:
-        """What taking displacements as small changes at this state, by contact. Collective."""
-        if not self._contacts:
-            return {}
-        moduli = [self._full.scales.modulus(i) for i in range(len(self._contacts))]
-        scales = self._full.scales
-        parts = [scales.parts_of(i) for i in range(len(self._contacts))]
-        return linearisation(self._contacts, parts, scales.round_off_of_groups, moduli, respond)
 
     def _deformation(self) -> dict[str, float]:
         """Largest displacement of every body but for its rigid motion, by its size. Collective.

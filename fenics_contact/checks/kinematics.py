@@ -7,23 +7,28 @@ solve with the present tangent.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fenics_contact.checks.condition import Condition
 from fenics_contact.contact.body import NEGLIGIBLE_SLIDE
-from fenics_contact.contact.choices import is_regularised
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import global_min, global_sum, longest
+from fenics_contact.parallel import global_mean, global_min, global_sum, longest
+from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Mask
 
-__all__ = ["Deviation", "LinearSprings", "Linearisation", "linearisation"]
+__all__ = ["Deviation", "Linearisation", "Respond", "answer", "linearisation", "spring_stiffness"]
 
-
+# The change of the relative displacements at the points of every contact by springs there and by
+# tractions added on the body.
+Respond = Callable[[Sequence[Array], Sequence[Array]], Sequence[Array]]
+# Mask of this rank's points of a contact on one group of coupled bodies, (n_points,), and whether
+# they bear nothing but round-off, as after an increment to no load.
+_Part = tuple[Mask, bool]
 # Share of the largest pressure, or of the force, below which what is left out needs no solve.
 _NEGLIGIBLE = 1e-3
 # Difference of the displacements on Γc, as a share of its size, below which pairs in the deformed
@@ -33,55 +38,36 @@ _TURNED = 1e-3
 _NOTABLE = 0.01
 
 
-@dataclass(frozen=True)
-class LinearSprings:
-    """A contact's springs at the present state, linearised with their status as it is.
+def spring_stiffness(contact: Contact) -> Array:
+    """What the traction loses per displacement at the present state, (n_points, gdim, gdim).
 
-    Attributes:
-        stiffness: What the traction loses per displacement, (n_points, gdim, gdim).
-        stretch: Displacement that is in the springs because their stiffness stands for none at
-            all, as far as displacements of Γc can answer it, (n_points, gdim) (length).
+    Linearised, with the status of the points as it is.
+
+    Args:
+        contact: Evaluated.
     """
+    law, values, status = contact.law, contact.values, contact.status
+    normal = values.normal
+    d = normal.shape[1]
+    stiffness = np.zeros((len(normal), d, d))
+    if law.has_normal_stiffness:
+        # A slipping point's friction follows the pressure as its bound does.
+        follows = (status == Status.SLIP) & (contact.pressure > 0) & (values.friction_bound > 0)
+        slope = np.where(follows, values.friction_bound_slope, 0.0)
+        ratio = slope / np.where(follows, values.friction_bound, 1.0)
+        direction = normal - ratio[:, None] * contact.tangential_traction
+        k_n = np.where(status != Status.OPEN, contact.normal_stiffness, 0.0)
+        stiffness += k_n[:, None, None] * np.einsum("qi,qj->qij", direction, normal)
+    if law.has_tangential:
+        sticks = (status == Status.STICK)[:, None, None]
+        stiffness += np.where(sticks, contact.tangential_stiffness, 0.0)
+        stiffness += _turning_stiffness(contact)
+    return stiffness
 
-    stiffness: Array
-    stretch: Array
 
-    @classmethod
-    def of(cls, contact: Contact) -> LinearSprings:
-        """Of an evaluated contact. Collective."""
-        law, values, status = contact.law, contact.values, contact.status
-        normal = values.normal
-        tangential, pressure = contact.tangential_traction, contact.pressure
-        closed = status != Status.OPEN
-        d = normal.shape[1]
-        stiffness = np.zeros((len(normal), d, d))
-        stretch = np.zeros_like(normal)
-        borne = _borne_by_springs(contact)
-        if law.has_normal_stiffness:
-            # A slipping point's friction follows the pressure as its bound does.
-            follows = (status == Status.SLIP) & (pressure > 0) & (values.friction_bound > 0)
-            slope = np.where(follows, values.friction_bound_slope, 0.0)
-            ratio = slope / np.where(follows, values.friction_bound, 1.0)
-            direction = normal - ratio[:, None] * tangential
-            k_n = np.where(closed, contact.normal_stiffness, 0.0)
-            stiffness += k_n[:, None, None] * np.einsum("qi,qj->qij", direction, normal)
-            if is_regularised(contact.law):
-                along = -np.sum(borne * normal, axis=1)
-                stretch += (along / contact.normal_stiffness)[:, None] * normal
-        if law.has_tangential:
-            k_t = contact.tangential_stiffness
-            stiffness += np.where((status == Status.STICK)[:, None, None], k_t, 0.0)
-            stiffness += _turning_stiffness(contact)
-            if is_regularised(contact.law):
-                # K_t has no inverse along the normal, where nothing acts: any stiffness will do.
-                along = np.einsum("q,qi,qj->qij", values.parameters["k_t"], normal, normal)
-                side = values.tangential(borne)
-                stretch -= np.linalg.solve(k_t + along, side[:, :, None])[:, :, 0]
-        return cls(stiffness, stretch)
-
-    def change(self, jump: Array) -> Array:
-        """Of the traction, by a change of the relative displacement, (n_points, gdim)."""
-        return -np.einsum("qij,qj->qi", self.stiffness, jump)
+def answer(stiffness: Array, jump: Array) -> Array:
+    """Change of the traction by one of the relative displacement, (n_points, gdim) (stress)."""
+    return -np.einsum("qij,qj->qi", stiffness, jump)
 
 
 def _turning_stiffness(contact: Contact) -> Array:
@@ -242,67 +228,38 @@ class Deviation:
         gap = np.where(told & closed & ~lost, np.nan_to_num(change), np.where(closing, true, 0.0))
         return cls(gap, turn, normal, lost, closing)
 
-    def springs(self, contact: Contact) -> LinearSprings:
-        """The springs of the contact where the bodies have moved to: lost ones and new ones."""
-        springs = LinearSprings.of(contact)
-        k_n = np.where(self.closing, contact.normal_stiffness, 0.0)
-        added = k_n[:, None, None] * np.einsum("qi,qj->qij", self.normal, self.normal)
-        kept = np.where(self.lost[:, None, None], 0.0, springs.stiffness)
-        return LinearSprings(kept + added, springs.stretch)
+    def linearised(self, contact: Contact) -> tuple[Array, Array]:
+        """Stiffness of the springs where the bodies have moved to: lost ones and new ones.
 
-    def added(self, contact: Contact, springs: LinearSprings) -> Array:
-        """Change of the tractions while displacements stay, (n_points, gdim) (stress).
-
-        Args:
-            contact: The contact.
-            springs: What `springs` gave.
+        Returns:
+            It, (n_points, gdim, gdim), see `spring_stiffness`, and the change of the tractions
+            while displacements stay, (n_points, gdim) (stress).
         """
         traction, values = contact.traction, contact.values
+        k_n = np.where(self.closing, contact.normal_stiffness, 0.0)
+        added = k_n[:, None, None] * np.einsum("qi,qj->qij", self.normal, self.normal)
+        lost = self.lost[:, None]
+        stiffness = np.where(lost[:, None], 0.0, spring_stiffness(contact)) + added
         turned = values.normal_traction[:, None] * self.turn
         along = np.where(self.closing[:, None], self.normal, values.normal)
-        change = turned + springs.change(-self.gap[:, None] * along)
-        return np.where(self.lost[:, None], -traction, change)
-
-
-def _borne_by_springs(contact: Contact) -> Array:
-    """What of the traction the springs bear in place of rigid contact: (n_points, gdim) (stress).
-
-    As far as displacements of Γc can answer it. Zero where the stiffness is physical. Collective.
-    """
-    law, values = contact.law, contact.values
-    if not is_regularised(contact.law):
-        return np.zeros_like(values.x)
-    pressure: Array = np.zeros(len(values.x))
-    if law.has_normal_stiffness:
-        pressure = contact.traces(contact.pressure)
-    side = contact.traces(contact.tangential_traction)
-    if contact.multipliers is not None:
-        pressure = pressure - contact.multipliers.fields.values("pressure")
-        if law.has_friction:
-            side = side - contact.multipliers.fields.values("traction")
-    return np.asarray(side - pressure[:, None] * values.normal)
+        change = turned + answer(stiffness, -self.gap[:, None] * along)
+        return stiffness, np.where(lost, -traction, change)
 
 
 def _moves(contact: Contact) -> bool:
     """Whether bodies slide or turn by enough for a search anew to find anything. Collective."""
     comm, values = contact.surface.mesh.comm, contact.values
-    d = values.normal.shape[1]
     smallest = global_min(comm, contact.quadrature.facet_sizes, empty=np.inf)
     x, u = values.x, contact.own_displacement()
     # A point without an opposite may find one wherever it goes.
     slid = longest(comm, np.where(contact.paired[:, None], values.slide, u))
-    sums = global_sum(comm, np.stack([x.sum(axis=0), u.sum(axis=0), np.full(d, len(x))]))
-    middle, mean = sums[:2] / np.maximum(sums[2], 1.0)
-    turned = longest(comm, u - mean) / max(longest(comm, x - middle), 1e-300)
+    size = max(longest(comm, x - global_mean(comm, x)), 1e-300)
+    turned = longest(comm, u - global_mean(comm, u)) / size
     return not (slid <= NEGLIGIBLE_SLIDE * smallest and turned <= _TURNED)
 
 
 def linearisation(
-    contacts: Sequence[Contact],
-    parts: Sequence[Mapping[int, Mask]],
-    round_off: Array,
-    moduli: Sequence[float],
-    respond: Callable[[Sequence[Array], Sequence[Array]], Sequence[Array]],
+    contacts: Sequence[Contact], scales: ReferenceScales, respond: Respond
 ) -> dict[str, Linearisation]:
     """Estimate the error of the small-displacement assumption, by contact. Collective.
 
@@ -311,64 +268,54 @@ def linearisation(
 
     Args:
         contacts: Evaluated contacts, at a solution.
-        parts: For every contact masks of the points on each group of coupled bodies,
-            `ReferenceScales.parts_of`.
-        round_off: Force on each group that is round-off, (n_groups,) (force).
-        moduli: Approximate modulus of the bodies of every contact (stress), to decide whether the
-            linear solve is needed.
-        respond: Returns the change of the relative displacements at the points of every contact
-            due to tractions added on the bodies, with given contact stiffness.
+        scales: Reference scales of the bodies.
+        respond: Solves with the bulk's tangent.
     """
     deviations = [Deviation.of(c) for c in contacts]
     looked_at = [
-        [part for part in _parts(c, masks, round_off) if _matters(c, deviation, part, modulus)]
-        for c, deviation, masks, modulus in zip(contacts, deviations, parts, moduli, strict=True)
+        [part for part in _parts(c, scales, i) if _matters(c, deviation, part, scales.modulus(i))]
+        for i, (c, deviation) in enumerate(zip(contacts, deviations, strict=True))
     ]
     slides = [(c.opposite.largest_slide(c.values), c.opposite.slide_limit) for c in contacts]
     if not any(looked_at):
         none = 0.0, 0.0, False
         return {c.name: Linearisation(*none, *s) for c, s in zip(contacts, slides, strict=True)}
-    pairs = list(zip(deviations, contacts, strict=True))
-    springs = [d.springs(c) for d, c in pairs]
-    added = [d.added(c, s) for (d, c), s in zip(pairs, springs, strict=True)]
-    jumps = respond([s.stiffness for s in springs], added)
-    return {
-        c.name: _worst([_relative(c, part, traction, s.change(jump)) for part in mine], slide)
-        for c, mine, s, traction, jump, slide in zip(
-            contacts, looked_at, springs, added, jumps, slides, strict=True
-        )
-    }
+    springs = [d.linearised(c) for d, c in zip(deviations, contacts, strict=True)]
+    stiffness, added = zip(*springs, strict=True)
+    jumps = respond(stiffness, added)
+    found = {}
+    for c, parts, k, traction, jump, slide in zip(
+        contacts, looked_at, stiffness, added, jumps, slides, strict=True
+    ):
+        errors = [(0.0, 0.0)] + [_relative(c, p, traction, answer(k, jump)) for p in parts]
+        force, pressure = np.max(errors, axis=0).tolist()  # one that is not a number wins
+        rough = bool(parts) and not c.rigid
+        found[c.name] = Linearisation(force, pressure, rough, *slide)
+    return found
 
 
-@dataclass(frozen=True)
-class _Part:
-    """The points of a contact on one group of coupled bodies.
+def _parts(contact: Contact, scales: ReferenceScales, number: int) -> list[_Part]:
+    """The parts of a contact, the same on all ranks. Collective.
 
-    Attributes:
-        points: Mask of this rank's points, (n_points,).
-        idle: Whether they bear nothing but round-off, as after an increment to no load.
+    Args:
+        contact: Evaluated.
+        scales: Reference scales of the bodies.
+        number: Of the contact.
     """
-
-    points: Mask
-    idle: bool
-
-
-def _parts(contact: Contact, masks: Mapping[int, Mask], round_off: Array) -> list[_Part]:
-    """The parts of a contact, the same on all ranks. Collective."""
+    masks = scales.parts_of(number)
     force = contact.measure * np.linalg.norm(contact.traction, axis=1)
-    own = np.array([force @ points for points in masks.values()])
-    borne = global_sum(contact.surface.mesh.comm, own)
-    idle = borne <= round_off[list(masks)]
-    return [_Part(points, bool(none)) for points, none in zip(masks.values(), idle, strict=True)]
+    borne = global_sum(contact.surface.mesh.comm, [force @ points for points in masks.values()])
+    idle = borne <= scales.round_off_of_groups[list(masks)]
+    return [(points, bool(none)) for points, none in zip(masks.values(), idle, strict=True)]
 
 
 def _matters(contact: Contact, deviation: Deviation, part: _Part, modulus: float) -> bool:
     """Whether what is left out could change forces or pressures of a part. Collective."""
-    comm, own = contact.surface.mesh.comm, part.points
+    comm, (own, idle) = contact.surface.mesh.comm, part
     measure, traction = contact.measure[own], contact.traction[own]
     sums = global_sum(comm, [measure @ (contact.pressure[own] > 0), measure.sum()])
     size = float(sums[0] or sums[1]) ** (1 / (contact.points.shape[1] - 1)) or 1.0
-    if part.idle:
+    if idle:
         gap = longest(comm, deviation.gap[own & deviation.closing])
         return not modulus / size * gap <= 0.0
     largest = longest(comm, traction)
@@ -378,12 +325,16 @@ def _matters(contact: Contact, deviation: Deviation, part: _Part, modulus: float
     return not max(turn, push, gone) <= _NEGLIGIBLE * largest
 
 
-def _relative(contact: Contact, part: _Part, added: Array, answered: Array) -> Linearisation:
-    """The error by the change of tractions at fixed displacements, and that by their change.
+def _relative(contact: Contact, part: _Part, added: Array, answered: Array) -> tuple[float, float]:
+    """Errors of force and pressure of a part, see `Linearisation`. Collective.
 
-    Collective.
+    Args:
+        contact: Evaluated.
+        part: Of it.
+        added: Change of the tractions while displacements stay, (n_points, gdim) (stress).
+        answered: That by the displacements which answer it, (n_points, gdim) (stress).
     """
-    comm, own = contact.surface.mesh.comm, part.points
+    comm, (own, idle) = contact.surface.mesh.comm, part
     measure = contact.measure[own]
     added, change = added[own], (added + answered)[own]
     pressure = contact.pressure[own]
@@ -393,18 +344,10 @@ def _relative(contact: Contact, part: _Part, added: Array, answered: Array) -> L
     along = np.sum(change * contact.values.normal[own], axis=1) / largest
     squares = [measure @ along**2, measure @ (pressure / largest) ** 2]
     changed, whole = np.sqrt(global_sum(comm, squares))
-    if part.idle:
+    if idle:
         # All of what it ought to bear is missing, but where a free body moves out of the way.
-        both = [np.linalg.norm(part, axis=1) for part in (change, added)]
-        size, at_rest = global_sum(comm, [measure @ part for part in both])
+        both = [np.linalg.norm(one, axis=1) for one in (change, added)]
+        size, at_rest = global_sum(comm, [measure @ one for one in both])
         size = 0.0 if size <= ROUND_OFF * at_rest < np.inf else size  # NaN: nothing is known
     force = float(np.linalg.norm(force_change)) / size if size else 0.0
-    return Linearisation(force, float(changed / whole) if whole else 0.0, not contact.rigid)
-
-
-def _worst(found: Sequence[Linearisation], slide: tuple[float, float]) -> Linearisation:
-    """The largest errors of all; one that is not a number wins."""
-    force = np.max([each.force for each in found], initial=0.0)
-    pressure = np.max([each.pressure for each in found], initial=0.0)
-    rough = any(each.rough for each in found)
-    return Linearisation(float(force), float(pressure), rough, *slide)
+    return force, float(changed / whole) if whole else 0.0

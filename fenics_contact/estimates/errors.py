@@ -16,8 +16,9 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from fenics_contact.checks.kinematics import Deviation, LinearSprings
+from fenics_contact.checks.kinematics import Deviation, answer, spring_stiffness
 from fenics_contact.compiling import compile_form
+from fenics_contact.contact.choices import is_regularised
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.markup import shown
@@ -291,31 +292,61 @@ def _linear_parts(
 ) -> dict[str, dict[str, float]]:
     """What the springs and the residual that is left have changed in the quantities."""
     contacts, operators = problem.contacts, problem.full.operators
-    springs = [LinearSprings.of(contact) for contact in contacts]
+    springs = [spring_stiffness(contact) for contact in contacts]
+    stretches = [_stretch(contact) for contact in contacts]
     found = {}
 
     def differences(way: Array, shifts: list[Array]) -> dict[str, float]:
         jumps = [shift + o.jump(way) for o, shift in zip(operators, shifts, strict=True)]
-        changes = [s.change(jump) for s, jump in zip(springs, jumps, strict=True)]
+        changes = [answer(k, jump) for k, jump in zip(springs, jumps, strict=True)]
         return _differences(problem, values, changes, way)
 
-    with problem.linearised([s.stiffness for s in springs]) as solve:
-        found["solver"] = differences(solve(None), [np.zeros_like(s.stretch) for s in springs])
+    with problem.linearised(springs) as solve:
+        found["solver"] = differences(solve(None), [np.zeros_like(s) for s in stretches])
         # The springs' rest lengths follow what they carry: a round of augmented enforcement.
         # It leaves 1/(1 + k_n h/E) of the error in the shortest waves and far less in the long ones
         # that forces are made of.
-        way = solve([s.change(s.stretch) for s in springs])
-        found["enforcement"] = differences(way, [s.stretch for s in springs])
-    deviations = [Deviation.of(contact) for contact in contacts]
-    pairs = list(zip(deviations, contacts, strict=True))
-    springs = [d.springs(c) for d, c in pairs]
-    added = [d.added(c, s) for (d, c), s in zip(pairs, springs, strict=True)]
-    with problem.linearised([s.stiffness for s in springs]) as solve:
-        way = solve(added)
-        tractions = zip(added, operators, springs, strict=True)
-        changes = [t + s.change(o.jump(way)) for t, o, s in tractions]
+        way = solve([answer(*both) for both in zip(springs, stretches, strict=True)])
+        found["enforcement"] = differences(way, stretches)
+    moved = [Deviation.of(contact).linearised(contact) for contact in contacts]
+    with problem.linearised([k for k, _ in moved]) as solve:
+        way = solve([added for _, added in moved])
+        pairs = zip(moved, operators, strict=True)
+        changes = [added + answer(k, o.jump(way)) for (k, added), o in pairs]
         found["kinematics"] = _differences(problem, values, changes, way)
     return found
+
+
+def _stretch(contact: Contact) -> Array:
+    """Displacement that is in the springs because their stiffness stands for none at all.
+
+    As far as displacements of Γc can answer it; none where the stiffness is physical. Collective.
+
+    Returns:
+        Array (n_points, gdim) (length).
+    """
+    law, values, normal = contact.law, contact.values, contact.values.normal
+    stretch = np.zeros_like(normal)
+    if not is_regularised(law):
+        return stretch
+    pressure: Array = np.zeros(len(normal))
+    if law.has_normal_stiffness:
+        pressure = contact.traces(contact.pressure)
+    side = contact.traces(contact.tangential_traction)
+    if contact.multipliers is not None:
+        pressure = pressure - contact.multipliers.fields.values("pressure")
+        if law.has_friction:
+            side = side - contact.multipliers.fields.values("traction")
+    borne = side - pressure[:, None] * normal
+    if law.has_normal_stiffness:
+        along = -np.sum(borne * normal, axis=1)
+        stretch += (along / contact.normal_stiffness)[:, None] * normal
+    if law.has_tangential:
+        # K_t has no inverse along the normal, where nothing acts: any stiffness will do.
+        along = np.einsum("q,qi,qj->qij", values.parameters["k_t"], normal, normal)
+        across = values.tangential(borne)[:, :, None]
+        stretch -= np.linalg.solve(contact.tangential_stiffness + along, across)[:, :, 0]
+    return stretch
 
 
 def _differences(
