@@ -176,16 +176,7 @@ class ContactProblem:
         self.full.update_stiffness()
         bulk.check_elastic()
         modulus = FollowedModulus(bulk, self.displacement, self.contacts)
-        obstacles = [
-            (contact.name, motion) for contact in self.contacts for motion in contact.motions
-        ]
-        self.motions = RigidBodyModes(
-            self.displacement,
-            unknowns,
-            self.full.scales,
-            [f"{m.kind} {m.way} of the obstacle of {name}" for name, m in obstacles],
-            turning=[motion.turns for _, motion in obstacles],
-        )
+        self.motions = RigidBodyModes(self.full)
         balance = LoadBalance(self.motions)
         self.initial_penetration = check_start(self.contacts)
         balance.find_free_modes(self.full)

@@ -230,8 +230,7 @@ class Approach:
         Returns:
             (n_free, n_local), and for every contact (n_free, n_points, gdim).
         """
-        full = self._full
-        fields, at_points = self._motions.present(full.operators, linear=full.bulk.linear)
+        fields, at_points = self._motions.present(self._full.operators)
         return fields[which], [jumps[which] for jumps in at_points]
 
     def _free(self, load: Array, which: Index) -> _Free | None:
@@ -250,7 +249,7 @@ class Approach:
         full, motions = self._full, self._motions
         every = np.zeros(len(motions.free))
         every[which] = coefficients
-        way = motions.displacement(every, linear=full.bulk.linear)
+        way = motions.displacement(every)
         self._full.evaluate_at(full.state() + np.where(full.constrained, 0.0, way))
 
     def _to_first_touch(self, free: _Free) -> Array | None:

@@ -69,8 +69,7 @@ class LoadBalance:
             ValueError: It names the mode.
         """
         modes = self._modes
-        every = np.arange(len(modes.free))
-        loose = modes.unconstrained(operators, every, closed_only=False) @ modes.free
+        loose = modes.unconstrained(operators, closed_only=False) @ modes.free
         if loose.size:
             motions = "; ".join(modes.describe(row) for row in loose)
             finite = any(operator.contact.finite for operator in operators)

@@ -72,10 +72,10 @@ class LooseModes:
         """
         n = len(motions.free)
         share, groups = np.full(scales.n_groups, np.nan), motions.groups()
-        loose = motions.unconstrained(operators, np.arange(n), closed_only=True, slips=True)
+        loose = motions.unconstrained(operators, closed_only=True, slips=True)
         if not len(loose) and not idle.any():
             return cls(share, idle, np.zeros((0, n)), np.zeros(0), np.zeros(0, dtype=np.intp))
-        stuck = motions.unconstrained(operators, np.arange(n), closed_only=True)
+        stuck = motions.unconstrained(operators, closed_only=True)
         is_open = idle.copy()
         is_open[groups[np.argmax(np.abs(stuck), axis=1)]] = True
         loose = np.concatenate([loose, np.eye(n)[idle[groups]]])

@@ -320,8 +320,8 @@ class Starts:
         if not len(modes):
             return way
         comm = full.unknowns.comm
-        every = motions.fields if full.bulk.linear else motions.present_fields()
-        every = np.array([system.part(np.where(full.constrained, 0.0, field)) for field in every])
+        free = [np.where(full.constrained, 0.0, field) for field in motions.present_fields()]
+        every = np.array([system.part(field) for field in free])
         fields = modes @ every
         sums = global_sum(comm, np.column_stack([fields @ fields.T, fields @ way]))
         share = agreed(comm, np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=NEGLIGIBLE)[0])

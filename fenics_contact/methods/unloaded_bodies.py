@@ -42,7 +42,7 @@ def move_unloaded_bodies(equations: Equations, part: Callable[[Array], Array]) -
         return False
     committed = [contact.states.committed.points for contact in full.contacts]
     present = [contact.values for contact in full.contacts]
-    modes = motions.find_unloaded(full.operators, [committed, present], linear=full.bulk.linear)
+    modes = motions.find_unloaded(full.operators, [committed, present])
     # Of a body with conditions that move it the least motion is not to stay where it is.
     change = np.where(full.constrained, full.state() - equations.began, 0.0)
     modes = modes[~motions.move_any(modes, full.scales.largest(change) > 0.0)]
@@ -64,18 +64,18 @@ def _move(equations: Equations, part: Callable[[Array], Array], modes: Array, gr
         Whether the solution is there now.
     """
     full, motions, system = equations.full, equations.motions, equations.system
-    linear, solution, moved = full.bulk.linear, full.state(), False
+    solution, moved = full.state(), False
     least = ROUND_OFF * full.scales.size_of_groups[group]
     acting = [motions.has_force(n, c, c.values) for n, c in enumerate(full.contacts)]
     # Where a force acts these modes close no gap, but for round-off.
     free = [~normal for normal, _ in acting]
     for _ in range(_LINEARISATIONS):
-        since = motions.fit(full.state() - equations.began, part, linear=linear)
+        since = motions.fit(full.state() - equations.began, part)
         present = [contact.values for contact in full.contacts]
         change = find_least_motion(full, motions, modes, present, since, free)
         if change is None or np.abs(change).max() <= least:
             break
-        way = motions.displacement(change, linear=linear)
+        way = motions.displacement(change)
         full.evaluate_at(full.state() + np.where(full.constrained, 0.0, way))
         moved = True
     if not moved:

@@ -97,9 +97,9 @@ def _pushed(full: FullSystem, motions: RigidBodyModes, bodies: Mask, began: Arra
     modes = np.eye(len(nothing))[motions.of_bodies_alone(bodies)]
     if not len(modes):
         return motions.size_by_body(nothing)
-    present, linear = full.state(), full.bulk.linear
-    since = motions.fit(present - began, np.asarray, linear=linear) @ modes.T @ modes
-    back = motions.displacement(-since, linear=linear)
+    present = full.state()
+    since = motions.fit(present - began, np.asarray) @ modes.T @ modes
+    back = motions.displacement(-since)
     full.set_state(present + np.where(full.constrained, 0.0, back))
     # Within an iteration the values of the contacts are kept: they may be of another state.
     states = [contact.states.evaluate_present() for contact in full.contacts]

@@ -31,6 +31,7 @@ class FullSystem(System):
 
     Attributes:
         bcs: Dirichlet conditions.
+        body: Body of every node of this rank, its ghosts last.
         displacement: What of it is one.
         stiffness: The bulk's tangent over all unknowns, after `update_stiffness`.
     """
@@ -66,7 +67,7 @@ class FullSystem(System):
         self.scales = ReferenceScales(displacement, body, label, self._moves, n_motions, contacts)
         self.stiffness: PETSc.Mat | None = None
         self._near_nullspace: PETSc.NullSpace | None = None
-        self._body = body
+        self.body = body
 
     @property
     def iterations_per_round(self) -> int:
@@ -82,7 +83,7 @@ class FullSystem(System):
         """`linear.cube_size` of the bodies; in the plane the unknowns. Collective at first."""
         if self.gdim != 3:
             return self.unknowns.first_motion
-        return linear.cube_size(self.displacement.u.function_space, self._body)
+        return linear.cube_size(self.displacement.u.function_space, self.body)
 
     def update_stiffness(self) -> bool:
         """Assemble the bulk's tangent if it may have changed; True if it did. Collective."""

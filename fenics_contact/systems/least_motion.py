@@ -56,7 +56,7 @@ def find_least_motion(
         Change in free motions, (n_free,) (length); None: none leaves no gap negative.
     """
     comm, scales = full.unknowns.comm, full.scales
-    fields, at_points = motions.present(full.operators, linear=full.bulk.linear)
+    fields, at_points = motions.present(full.operators)
     rows = [np.zeros((0, len(modes) + 1))]
     closed = closed or [np.zeros(len(values.gap)) for values in states]
     points = zip(full.operators, at_points, states, among, closed, strict=True)

@@ -13,12 +13,10 @@ from fenics_contact import compat
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import PointValues, Status
 from fenics_contact.parallel import agreed, global_sum
-from fenics_contact.surface.bodies import connected_bodies
-from fenics_contact.surface.displacement import Displacement
+from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.modes import rigid_motions
 from fenics_contact.systems.operator import ContactOperator
-from fenics_contact.systems.reference_scales import ReferenceScales, body_of_points
-from fenics_contact.systems.unknowns import Unknowns
+from fenics_contact.systems.reference_scales import body_of_points
 from fenics_contact.tolerances import FLAT, NEGLIGIBLE, ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
@@ -41,33 +39,19 @@ class RigidBodyModes:
         fields: Their fields at this rank's unknowns, of the undeformed bodies, (n_free, n_local).
     """
 
-    def __init__(
-        self,
-        displacement: Displacement,
-        unknowns: Unknowns,
-        scales: ReferenceScales,
-        obstacles: Sequence[str] = (),
-        *,
-        turning: Sequence[bool] = (),
-    ) -> None:
+    def __init__(self, full: FullSystem) -> None:
         """Make the motions at this rank's unknowns. Collective.
 
         Args:
-            displacement: What moves.
-            unknowns: The dofs and the free motions of obstacles, each a rigid motion of its own.
-            scales: Reference scales of the bodies.
-            obstacles: Names of the free motions of obstacles.
-            turning: Which of them are rotations, whose arms change with the state.
+            full: The system. Each free motion of an obstacle is a rigid motion of its own.
         """
-        space = displacement.u.function_space
-        self.comm = space.mesh.comm
-        gdim = space.mesh.geometry.dim
+        space, unknowns = full.displacement.u.function_space, full.unknowns
         n_owned = space.dofmap.index_map.size_local
-        x = space.tabulate_dof_coordinates()[:n_owned, :gdim]
-        n_bodies, self._body = connected_bodies(space)
-        self._space, self._scales = space, scales
-        self._centres, self._sizes = scales.centre, scales.size
-        self._displacement, self._unknowns, self._x = displacement, unknowns, x
+        x = space.tabulate_dof_coordinates()[:n_owned, : full.gdim]
+        n_bodies = full.scales.n_bodies
+        self.comm, self._full, self._scales = unknowns.comm, full, full.scales
+        self._centres, self._sizes = full.scales.centre, full.scales.size
+        self._displacement, self._unknowns, self._x = full.displacement, unknowns, x
         self.names: list[str] = []
         turns: list[float] = []
         for b in range(n_bodies):
@@ -75,10 +59,12 @@ class RigidBodyModes:
             for name in rigid_motions(x[:0], 1.0):
                 self.names.append(name + (of if n_bodies > 1 else ""))
                 turns.append(self._sizes[b] if name.startswith("rotation") else 0.0)
-        n_modes, n_obstacles = len(self.names), len(obstacles)
-        self.names += obstacles
+        moving = [(contact.name, m) for contact in full.contacts for m in contact.motions]
+        n_modes, n_obstacles = len(self.names), len(moving)
+        self.names += [f"{m.kind} {m.way} of the obstacle of {name}" for name, m in moving]
         self.turns = np.array(turns + [0.0] * n_obstacles)
-        self._turning = np.array([False] * n_modes + list(turning), dtype=np.bool_)
+        # Rotations of obstacles, whose arms change with the state.
+        self._turning = np.array([False] * n_modes + [m.turns for _, m in moving], dtype=np.bool_)
         still = np.zeros(unknowns.n_dofs)
         of_obstacles = [unknowns.joined(still, row) for row in np.eye(n_obstacles)]
         self._of_obstacles = np.array(of_obstacles).reshape(n_obstacles, unknowns.n_local)
@@ -99,7 +85,7 @@ class RigidBodyModes:
         """All motions, with the nodes of this rank at places, (n_motions, n_local)."""
         modes = []
         for b, (centre, size) in enumerate(zip(self._centres, self._sizes, strict=True)):
-            mine = self._body[: len(x), None] == b
+            mine = self._full.body[: len(x), None] == b
             for mode in rigid_motions(x - centre, size).values():
                 modes.append(self._over_unknowns(np.where(mine, mode, 0.0)))
         return np.concatenate([modes, self._of_obstacles])
@@ -211,7 +197,15 @@ class RigidBodyModes:
         return np.asarray(of_each.reshape(n_bodies, n_motions).sum(axis=1))
 
     def present_fields(self) -> Array:
-        """`fields` of the bodies where they are now, about the same centres, (n_free, n_local)."""
+        """The free motions of the bodies where they are now, about the same centres.
+
+        `fields` where the bulk is linear: to it small rotations alone are rigid.
+
+        Returns:
+            At this rank's unknowns, (n_free, n_local).
+        """
+        if self._full.bulk.linear:
+            return self.fields
         return np.asarray(self.free @ self._modes_at(self._places()), dtype=np.float64)
 
     def _places(self) -> Array:
@@ -219,51 +213,49 @@ class RigidBodyModes:
         n, d = self._x.shape
         return self._x + self._displacement.u.x.array[: n * d].reshape(n, d)
 
-    def present(
-        self, operators: Sequence[ContactOperator], *, linear: bool
-    ) -> tuple[Array, list[Array]]:
+    def present(self, operators: Sequence[ContactOperator]) -> tuple[Array, list[Array]]:
         """The free motions at this rank's unknowns, and at points of contacts. Collective.
 
         Args:
             operators: Of the contacts, over all unknowns.
-            linear: Whether they are those of the undeformed bodies: to a linear bulk small
-                rotations alone are rigid.
 
         Returns:
-            (n_free, n_local), and for every contact their jumps, (n_free, n_points, gdim).
+            `present_fields`, and for every contact their jumps, (n_free, n_points, gdim).
         """
-        if linear:
-            return self.fields, [self.at_points(operator) for operator in operators]
-        fields, shape = self.present_fields(), (len(self.free), -1, self._x.shape[1])
+        fields = self.present_fields()
+        if self._full.bulk.linear:
+            return fields, [self.at_points(operator) for operator in operators]
+        shape = len(self.free), -1, self._x.shape[1]
         found = [np.array([o.jump(field) for field in fields]) for o in operators]
         return fields, [jumps.reshape(shape) for jumps in found]
 
-    def fit(self, change: Array, part: Callable[[Array], Array], *, linear: bool) -> Array:
+    def fit(self, change: Array, part: Callable[[Array], Array]) -> Array:
         """Find the free motions nearest to a change of this rank's unknowns, (n_free,). Collective.
 
         Args:
             change: The change.
             part: Takes those unknowns that are compared.
-            linear: As in `present`.
         """
-        fields = np.array([part(f) for f in (self.fields if linear else self.present_fields())])
+        fields = np.array([part(field) for field in self.present_fields()])
         sums = global_sum(self.comm, np.column_stack([fields @ fields.T, fields @ part(change)]))
         found = np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=NEGLIGIBLE)[0]
         return np.asarray(agreed(self.comm, found), dtype=np.float64)
 
-    def displacement(self, coefficients: Array, *, linear: bool) -> Array:
+    def displacement(self, coefficients: Array) -> Array:
         """By how much unknowns change as free motions go on from here, (n_local,).
+
+        Rotations are of any size, but to a linear bulk.
 
         Args:
             coefficients: Of the free motions, (n_free,).
-            linear: As in `present`; otherwise rotations are of any size.
         """
+        linear = self._full.bulk.linear
         return coefficients @ self.fields if linear else self.turned(coefficients @ self.free)
 
     def turned(self, coefficients: Array) -> Array:
         """By how much unknowns change as bodies go on, and turn about their centres, from here.
 
-        What `present_fields` are to first order: rotations of any size.
+        Rotations are of any size.
 
         Args:
             coefficients: Of all motions, (n_motions,).
@@ -281,7 +273,7 @@ class RigidBodyModes:
             at = np.tensordot(by_motion, kinds, axes=1)
             twist[:d, d], twist[:d, :d] = at[0], (at[1:] - at[0]).T
             change = scipy.linalg.expm(twist)[:d] - np.eye(d + 1)[:d]
-            mine = self._body[: len(x)] == b
+            mine = self._full.body[: len(x)] == b
             way[mine] = (x[mine] - self._centres[b]) @ change[:, :d].T + change[:, d]
         obstacles = coefficients[n_bodies * n_motions :] @ self._of_obstacles
         return np.asarray(self._over_unknowns(way) + obstacles, dtype=np.float64)
@@ -307,11 +299,11 @@ class RigidBodyModes:
 
     def _travels_at(self, operator: ContactOperator) -> Array:
         """What points of a contact feel of the bodies' motions, (n_bodies, n_per_body, ...)."""
-        space, (n_bodies, n_motions, _) = self._space, self.of_bodies.shape
+        space, (n_bodies, n_motions, _) = self._displacement.u.function_space, self.of_bodies.shape
         contact = operator.contact
         points = contact.points
         travels = np.zeros((n_bodies, n_motions, *points.shape))
-        own = body_of_points(contact, space, self._body)
+        own = body_of_points(contact, space, self._full.body)
         for b in range(n_bodies):
             placed = rigid_motions(points - self._centres[b], self._sizes[b])
             travels[b] = np.where((own == b)[:, None], np.array(list(placed.values())), 0.0)
@@ -360,8 +352,7 @@ class RigidBodyModes:
         lacks = [np.any(was & ~now) for was, now in zip(known, bearing, strict=bool(known))]
         if self.comm.allreduce(not known or any(lacks)) == 0:
             return True
-        every = np.arange(len(self.free))
-        held = not self.unconstrained(operators, every, closed_only=True).size
+        held = not self.unconstrained(operators, closed_only=True).size
         if held:
             self._holding, self._holders = bearing, weakref.WeakSet(operators)
         return held
@@ -369,29 +360,27 @@ class RigidBodyModes:
     def unconstrained(
         self,
         operators: Sequence[ContactOperator],
-        rows: Index,
         *,
         closed_only: bool,
         slips: bool = False,
     ) -> Array:
-        """What no contact feels of some free motions, (n_loose, n_rows). Collective.
+        """What no contact feels of the free motions, (n_loose, n_free). Collective.
 
         Their jumps are squared and relative to the area of Γc that belongs to the bodies they move.
 
         Args:
             operators: Of evaluated contacts, over all unknowns.
-            rows: Numbers of the free motions to look at.
             closed_only: Whether the points at which contact acts now alone feel any, see
                 `is_constrained`.
             slips: Whether those that slip feel no motion along their friction.
         """
-        n_free = len(rows)
+        n_free = len(self.free)
         gram: Array = np.zeros((n_free, n_free))
         area: Array = np.zeros(n_free)
-        together = self.of_same_body()[np.ix_(rows, rows)].astype(np.float64)
+        together = self.of_same_body().astype(np.float64)
         for operator in operators:
             contact, values = operator.contact, operator.contact.values
-            modes = self.at_points(operator)[rows]
+            modes = self.at_points(operator)
             along = np.einsum("mqd,qd->mq", modes, values.normal)
             weights = contact.quadrature.weights
             if closed_only:
@@ -405,14 +394,12 @@ class RigidBodyModes:
                 modes = modes - np.einsum("mqd,qd->mq", modes, way)[:, :, None] * way
             gram += tangential_gram(contact, modes, closed_only=closed_only)
         gram, area = global_sum(self.comm, gram), global_sum(self.comm, area)
-        return self._null_space(gram, area, rows)
+        return self._null_space(gram, area)
 
     def find_unloaded(
         self,
         operators: Sequence[ContactOperator],
         states: Sequence[Sequence[PointValues | None]],
-        *,
-        linear: bool,
     ) -> Array:
         """Find the modes along which no contact force acts, (n_unloaded, n_free). Collective.
 
@@ -423,13 +410,12 @@ class RigidBodyModes:
         Args:
             operators: Of the contacts, over all unknowns.
             states: Values at the points of every contact in each; None: there was no force.
-            linear: As in `present`.
         """
         n, scales = len(self.free), self._scales
         gram: Array = np.zeros((n, n))
         area: Array = np.zeros(n)
         unknown: Array = np.zeros(scales.n_groups)
-        at_points = self.present(operators, linear=linear)[1]
+        at_points = self.present(operators)[1]
         for number, (operator, modes) in enumerate(zip(operators, at_points, strict=True)):
             contact, weights = operator.contact, operator.contact.quadrature.weights
             felt = np.abs(modes).max(axis=2, initial=0.0) > NEGLIGIBLE
@@ -446,7 +432,7 @@ class RigidBodyModes:
                 gram += np.einsum("mqd,q,nqd->mn", across, weights * acts[1], across)
                 unknown[group[acts.any(axis=0) & (values.paired > 0) & ~contact.paired]] = 1.0
         gram, area, unknown = (global_sum(self.comm, part) for part in (gram, area, unknown))
-        found = self._null_space(gram, area, np.arange(n))
+        found = self._null_space(gram, area)
         return found[~((found != 0.0) @ (unknown[self.groups()] > 0.0))]
 
     def has_force(self, number: int, contact: Contact, values: PointValues) -> Mask:
@@ -466,23 +452,23 @@ class RigidBodyModes:
         acts = forces > self._scales.round_off_at_points(number, forces.max(axis=0))
         return np.asarray(acts | (contact.law.has_tension & (values.paired > 0)))
 
-    def _null_space(self, gram: Array, area: Array, rows: Index) -> Array:
-        """Combinations of free motions that a sum over points does not feel, (n_found, n_rows).
+    def _null_space(self, gram: Array, area: Array) -> Array:
+        """Combinations of free motions that a sum over points does not feel, (n_found, n_free).
 
         Collective.
 
         Args:
-            gram: Products of the motions by what is felt, weighted by area, (n_rows, n_rows).
-            area: Of the points that feel each, (n_rows,).
-            rows: Their numbers among the free motions.
+            gram: Products of the motions by what is felt, weighted by area, (n_free, n_free).
+            area: Of the points that feel each, (n_free,).
         """
         scale = 1 / np.sqrt(np.where(area > 0, area, 1.0))
         gram = gram * np.outer(scale, scale)
-        loose, groups = [np.zeros((0, len(rows)))], self.groups()[rows]
+        n, groups = len(area), self.groups()
+        loose = [np.zeros((0, n))]
         for group in np.unique(groups):  # no vector is of several
             mine = np.flatnonzero(groups == group)
             sizes, vectors = np.linalg.eigh(gram[np.ix_(mine, mine)])
-            found = np.zeros((np.count_nonzero(sizes < NEGLIGIBLE), len(rows)))
+            found = np.zeros((np.count_nonzero(sizes < NEGLIGIBLE), n))
             found[:, mine] = (vectors * scale[mine, None])[:, sizes < NEGLIGIBLE].T
             loose.append(found)
         return agreed(self.comm, np.concatenate(loose))
