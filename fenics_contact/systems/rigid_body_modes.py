@@ -73,9 +73,6 @@ class RigidBodyModes:
         self.of_bodies = self._modes[:n_modes].reshape(shape)
         self.free: Array = np.zeros((0, n_modes))
         self.fields: Array = np.zeros((0, unknowns.n_local))
-        # Masks of points that were found to hold all motions, and of which contacts.
-        self._holding: list[Mask] = []
-        self._holders: weakref.WeakSet[ContactOperator] = weakref.WeakSet()
         self._jumps: weakref.WeakKeyDictionary[ContactOperator, Array]
         self._jumps = weakref.WeakKeyDictionary()
         self._travels: weakref.WeakKeyDictionary[ContactOperator, Array]
@@ -124,7 +121,6 @@ class RigidBodyModes:
         self.free = _plain(free.T)
         self._scales.held = np.all(~np.hstack(self._moved()), axis=0)
         self.fields = self.free @ self._modes
-        self._holding = []
         for vector in (work, image):
             vector.destroy()
 
@@ -338,24 +334,7 @@ class RigidBodyModes:
         Args:
             operators: Of evaluated contacts, over all unknowns.
         """
-        if not len(self.free):
-            return True
-        bearing = []
-        for contact in (operator.contact for operator in operators):
-            bearing.append(contact.status != Status.OPEN)
-            if contact.law.has_tangential:
-                bearing.append(_resists_tangentially(contact, closed_only=True))
-        # What holds a body still does with more of Γc closed: no need to look again.
-        same = bool(self._holding) and all(operator in self._holders for operator in operators)
-        same = same and not self._turning.any()
-        known = self._holding if same else []
-        lacks = [np.any(was & ~now) for was, now in zip(known, bearing, strict=bool(known))]
-        if self.comm.allreduce(not known or any(lacks)) == 0:
-            return True
-        held = not self.unconstrained(operators, closed_only=True).size
-        if held:
-            self._holding, self._holders = bearing, weakref.WeakSet(operators)
-        return held
+        return not (len(self.free) and self.unconstrained(operators, closed_only=True).size)
 
     def unconstrained(
         self,
