@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,16 +30,17 @@ _LINEAR_ROTATION = np.pi / 2 + 1e-9
 _BISECTIONS = 20
 
 
-@dataclass(frozen=True)
 class ObstaclePaths:
     """The motion of Γc relative to a rigid obstacle in an increment, in the obstacle's frame.
+
+    Its attributes are set by the class that samples the obstacle, `RigidObstacleProbe`.
 
     Attributes:
         comm: The ranks.
         places: Of Γc.
         sampler: The obstacle.
         rotation: Of the obstacle in the increment.
-        start, field: The nodes of Γc at both ends, (n_nodes, gdim) (length).
+        start, field: The nodes of Γc at both ends, (n_nodes, gdim) (length); see `FacetPlaces`.
         facet, reference: Facet of this rank and reference coordinates of every place, (n, ...).
         x: The place on the undeformed Γc, (n, gdim) (length).
         z: The place at the end, (n, gdim) (length).
