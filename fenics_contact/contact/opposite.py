@@ -134,6 +134,8 @@ class ObstacleMotion:
 class Opposite(ABC):
     """What lies opposite Γc, under one kinematics.
 
+    The ``values`` that methods take are those of the last evaluation where nothing else is said.
+
     Attributes:
         pairs: What lies opposite each of the points.
         data: What was given, sampled at the points.
@@ -329,11 +331,7 @@ class Opposite(ABC):
     # ---- where it is -----------------------------------------------------------------------------
 
     def undeformed_gap(self, values: PointValues) -> Array:
-        """Gap of the undeformed Γc, 0 where nothing is opposite, (n_points,) (length).
-
-        Args:
-            values: Of the last evaluation.
-        """
+        """Gap of the undeformed Γc, 0 where nothing is opposite, (n_points,) (length)."""
         return values.initial_gap
 
     @abstractmethod
@@ -342,9 +340,6 @@ class Opposite(ABC):
 
         With finite kinematics these are the gap and normal of the contact itself. Opposite another
         body they are by a search anew, in which the pairs stay as they are.
-
-        Args:
-            values: Of the last evaluation.
 
         Returns:
             Gap, (n_points,) (length): NaN where there is no opposite, and infinite where an
@@ -382,9 +377,6 @@ class Opposite(ABC):
 
         At the committed ``u`` it is the displacement of a rigid obstacle since the last commit,
         (n_points, gdim) (length).
-
-        Args:
-            values: Of the last evaluation.
         """
         return self.turned(self.committed_jump - values.jump)
 
@@ -398,10 +390,9 @@ class Opposite(ABC):
         return ObstacleMotion(self.committed_offset(values), turn, self.present_jump())
 
     def angle(self, values: PointValues) -> float:
-        """By which the obstacle has turned since it began, 0 where it cannot (radians). Collective.
+        """By which the obstacle has turned since it began, 0 where it cannot (radians).
 
-        Args:
-            values: Of the last evaluation.
+        Collective.
         """
         return self._angle(values.arrays)
 
@@ -457,9 +448,6 @@ class Opposite(ABC):
 
         At X with small displacements, at X + u with finite ones. Collective.
 
-        Args:
-            values: Of the last evaluation.
-
         Returns:
             (n_points,); 0 of a gap that is given on Γc, and between bodies.
         """
@@ -481,11 +469,7 @@ class Opposite(ABC):
         return vectors
 
     def rotation_in_increment(self, values: PointValues) -> IncrementalRotation:
-        """Rotation of the obstacle since the last commit. Collective.
-
-        Args:
-            values: Of the last evaluation.
-        """
+        """Rotation of the obstacle since the last commit. Collective."""
         return IncrementalRotation()
 
     def largest_curvature(self) -> Array | None:
@@ -509,11 +493,7 @@ class Opposite(ABC):
         return False
 
     def transmitting_points(self, values: PointValues) -> Mask:
-        """Mask of the points that transmit forces to another body, (n_points,).
-
-        Args:
-            values: Of the last evaluation.
-        """
+        """Mask of the points that transmit forces to another body, (n_points,)."""
         return np.zeros(len(values.x), dtype=np.bool_)
 
     @property
