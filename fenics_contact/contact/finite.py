@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import ufl
@@ -34,7 +34,6 @@ __all__ = [
     "FiniteKinematics",
     "Frame",
     "SampledView",
-    "View",
     "check_places",
     "check_rigid",
     "depends_on_place",
@@ -80,32 +79,8 @@ class Frame:
         return ufl.dot(ufl.transpose(self.rotation[0]), vector)
 
 
-class View(Protocol):
-    """How an obstacle is seen from points that have moved (UFL)."""
-
-    def gap(self, jump: Any) -> Any:
-        """Distance to the obstacle at X + u (length)."""
-
-    def normal(self, jump: Any) -> Any:
-        """Unit normal from body to obstacle there."""
-
-    def relative(self, jump: Any) -> Any:
-        """Displacement in the frame of the obstacle (length)."""
-
-    def framed(self, vector: Any) -> Any:
-        """A direction as it is in that frame."""
-
-    def carried(self, name: str) -> Any:
-        """What was committed, as the obstacle has carried it along.
-
-        Args:
-            name: "foot", its place minus X (length); "traction" and "normal", of the multipliers
-                where there are any; "committed traction" and "committed normal".
-        """
-
-
 class ExactView:
-    """By the expressions of the obstacle themselves."""
+    """How an obstacle is seen from points that have moved: by its own expressions."""
 
     def __init__(
         self,
@@ -128,25 +103,30 @@ class ExactView:
         self._history, self._multipliers = history, multipliers
 
     def gap(self, jump: Any) -> Any:
-        """See `View.gap`."""
+        """Distance to the obstacle at X + u (UFL, length)."""
         return self._place(self._frame.into(self._x + jump)).gap
 
     def normal(self, jump: Any) -> Any:
-        """See `View.normal`."""
+        """Unit normal from body to obstacle there (UFL)."""
         return self._frame.turned(self._place(self._frame.into(self._x + jump)).normal)
 
     def relative(self, jump: Any) -> Any:
-        """See `View.relative`."""
+        """Displacement in the frame of the obstacle (UFL, length)."""
         if self._frame.rotation is None:  # not X less X
             return jump if self._frame.shift is None else jump - self._frame.shift
         return self._frame.into(self._x + jump) - self._x
 
     def framed(self, vector: Any) -> Any:
-        """See `View.framed`."""
+        """A direction as it is in that frame (UFL)."""
         return self._frame.turned_back(vector)
 
     def carried(self, name: str) -> Any:
-        """See `View.carried`."""
+        """What was committed, as the obstacle has carried it along (UFL).
+
+        Args:
+            name: "foot", its place minus X (length); "traction" and "normal", of the multipliers
+                where there are any; "committed traction" and "committed normal".
+        """
         if name == "foot":
             foot = self._history.ufl("jump")
             if self._frame.rotation is None:
@@ -159,7 +139,7 @@ class ExactView:
 
 
 class SampledView:
-    """By numbers at the points, and derivatives there: exact at `update`'s displacement.
+    """The same by numbers at the points, and derivatives there: exact at `update`'s displacement.
 
     Laws are compiled for numbers at points, and serve every obstacle. Gap and normal are linear
     about the displacement that they were sampled at, so that the first derivatives of tractions
@@ -221,28 +201,28 @@ class SampledView:
         return np.asarray(np.einsum("qij,qj->qi", axes, vectors))
 
     def gap(self, jump: Any) -> Any:
-        """See `View.gap`."""
+        """See `ExactView.gap`."""
         field = self._fields.ufl
         return field("gap") + ufl.dot(field("slope"), jump - field("at"))
 
     def normal(self, jump: Any) -> Any:
-        """See `View.normal`."""
+        """See `ExactView.normal`."""
         field, change = self._fields.ufl, jump - self._fields.ufl("at")
         turn = [ufl.dot(field(f"turn {i}"), change) for i in range(self._d)]
         return field("normal") + ufl.as_vector(turn)
 
     def relative(self, jump: Any) -> Any:
-        """See `View.relative`."""
+        """See `ExactView.relative`."""
         return self._fields.ufl("relative") + self.framed(jump - self._fields.ufl("at"))
 
     def framed(self, vector: Any) -> Any:
-        """See `View.framed`."""
+        """See `ExactView.framed`."""
         if not self._turns:
             return vector
         return combined(vector, [self._fields.ufl(f"axis {i}") for i in range(self._d)])
 
     def carried(self, name: str) -> Any:
-        """See `View.carried`."""
+        """See `ExactView.carried`."""
         return self._fields.ufl(f"carried {name}")
 
 
@@ -253,7 +233,7 @@ class FiniteKinematics:
     first, from where the obstacle is now, has lost.
     """
 
-    def __init__(self, view: View, multipliers: PointFields | None) -> None:
+    def __init__(self, view: ExactView | SampledView, multipliers: PointFields | None) -> None:
         """Take how the obstacle is seen.
 
         Args:
