@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import ufl
 from dolfinx import fem
-from petsc4py import PETSc
 
 from fenics_contact.contact.opposite import Opposite, Parts
 from fenics_contact.contact.pairs import Pairs
@@ -214,16 +213,6 @@ class FollowedOpposite(BodyOpposite):
     def may_pair_anew(self) -> bool:
         """See `Opposite`: not at a commit alone, whatever the obstacle says."""
         return False
-
-    @property
-    def degenerate(self) -> bool:
-        """See `Opposite`."""
-        return self._present.degenerate
-
-    @property
-    def local_map(self) -> PETSc.Mat | None:
-        """See `Opposite`."""
-        return self._present.local_map
 
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
         """See `Opposite`: they are found wherever points are updated."""

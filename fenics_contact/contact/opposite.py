@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import ufl
 from dolfinx import fem
-from petsc4py import PETSc
 
 from fenics_contact.contact.inputs import Inputs, check_given
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
@@ -152,11 +151,8 @@ class Opposite(ABC):
         follows: Whether the pairs follow the bodies wherever they go.
         pairs_anew: Whether pairs are found anew, on the deformed bodies, at every commit and in
             increments in which bodies slide.
-        degenerate: Whether Γc has lost its tangent plane somewhere, where pairs follow the bodies.
         sampler: What evaluates a rigid obstacle anywhere; None where it is known on Γc alone, or
             the opposite is another body.
-        local_map: Sparse map from ``u`` to what derivatives at the points are by, where that is
-            another than ``pairs.jump_map``; None: there is none.
     """
 
     is_finite = False
@@ -520,16 +516,6 @@ class Opposite(ABC):
             values: Of the state to be committed.
         """
         return False
-
-    @property
-    def degenerate(self) -> bool:
-        """See the class."""
-        return False
-
-    @property
-    def local_map(self) -> PETSc.Mat | None:
-        """See the class."""
-        return None
 
     def needs_new_pairs(self, values: PointValues, of: PointValues | None = None) -> bool:
         """Whether points have left their pairs, or come to some. Collective.

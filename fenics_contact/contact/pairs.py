@@ -48,6 +48,8 @@ class Pairs:
         search: The surface opposite, to search; likewise.
         found_at: Displacement in which the present pairs were found; None: the undeformed bodies.
         found_jump: The jump then, (n_points, gdim) (length); likewise.
+        degenerate: Whether pairs that follow the bodies find Γc without a tangent plane at some
+            point of any rank: a trial state that has gone astray.
     """
 
     def __init__(
@@ -66,6 +68,7 @@ class Pairs:
         self.acts: fem.Function | None = None
         self.found_at: fem.Function | None = None
         self.found_jump: Array | None = None
+        self.degenerate = False
         if isinstance(obstacle, DeformableBody):
             self.search = Pairing(obstacle, quadrature, u.function_space)
             self.distance = fem.Function(quadrature.space(), name="distance")
@@ -148,6 +151,11 @@ class Pairs:
         Collective. Of pairs that stay it is `jump_map`.
         """
         return self.jump_map
+
+    @property
+    def local_map(self) -> PETSc.Mat | None:
+        """Map from ``u`` to what derivatives at the points are by; None: it is `jump_map`."""
+        return None
 
     def depth(self, normal_displacement: Array) -> Array:
         """Depth of points in the opposite, whatever gap is prescribed: (n_points,) (length)."""

@@ -39,7 +39,7 @@ class PointTangent:
 
     Attributes:
         by_jump: By the displacement of the body, (n_points, gdim, gdim) (stress/length); where
-            `Opposite.local_map` is one, of the forces on the local unknowns by these.
+            `Pairs.local_map` is one, of the forces on the local unknowns by these.
         by_shift: By that of the obstacle, likewise; None where no component of it is free.
         spun: By a turn of body and obstacle together, ω × the traction, (n_points, gdim) (stress);
             None where the obstacle is not turned by a moment. Anisotropic friction, whose direction

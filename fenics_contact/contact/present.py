@@ -90,8 +90,6 @@ class PresentPairs(Pairs):
         told: "jump", the displacement relative to the partner since the last commit (length);
             "foot", nothing; "turn I", rows of R; "committed", R times the committed traction
             (stress).
-        degenerate: Whether Γc has no tangent plane at some point of any rank: a trial state that
-            has gone astray.
     """
 
     def __init__(
@@ -106,7 +104,6 @@ class PresentPairs(Pairs):
         self.felt = PointFields(quadrature, {"gap": 0, "normal": d, "slip": d, "traction": d})
         turns = {f"turn {i}": d for i in range(d)}
         self.told = PointFields(quadrature, {"jump": d, "foot": d, "committed": d} | turns)
-        self.degenerate = False
         self._where: tuple[Array, Array] | None = None
         self._at_rest: tuple[Array, Array] | None = None
         self._committed: _Committed | None = None

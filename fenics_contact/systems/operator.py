@@ -212,7 +212,7 @@ class ContactOperator:
             A new matrix over the unknowns (force/length).
         """
         tangent = tangent or self.contact.acting.tangent()
-        local = self.contact.opposite.local_map
+        local = self.contact.pairs.local_map
         if local is not None:  # of pairs that follow the bodies; see `PresentPairs.tangent`
             lifted = self.unknowns.widened(self.contact.displacement.lifted(local))
             return self._sandwiched(-self.contact.area[:, None, None] * tangent.by_jump, lifted)

@@ -263,8 +263,8 @@ class System(ABC):
         return any(not abs(turn) < _TURN for turn in turns)
 
     def is_degenerate(self) -> bool:
-        """Whether Γc has lost its tangent plane somewhere; see `Opposite.degenerate`."""
-        return any(contact.opposite.degenerate for contact in self.contacts)
+        """Whether Γc has lost its tangent plane somewhere; see `Pairs.degenerate`."""
+        return any(contact.pairs.degenerate for contact in self.contacts)
 
     @abstractmethod
     def state(self) -> Array:
