@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
-from functools import cached_property, lru_cache
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -83,12 +84,6 @@ class Resultants:
         return self.extents["contact"].area
 
 
-@lru_cache(maxsize=64)
-def _everywhere(value: float, shape: tuple[int, ...]) -> Array:
-    """An array of one value, which cannot be written to."""
-    return np.broadcast_to(value, shape)
-
-
 @dataclass(frozen=True)
 class PointValues:
     """Fields at this rank's points at one state, (n_points,) or (n_points, gdim).
@@ -98,7 +93,6 @@ class PointValues:
     Attributes:
         x: Places of the points (length).
         normal: Unit normal n from body to obstacle.
-        direction_length: Length of the direction it was given by.
         facing: n by the outward normal of the body.
         weight: Factor of the surface measure.
         initial_gap: s (length), the motion of the obstacle included.
@@ -137,7 +131,6 @@ class PointValues:
 
     x: Array
     normal: Array
-    direction_length: Array
     facing: Array
     weight: Array
     initial_gap: Array
@@ -181,34 +174,20 @@ class PointValues:
             for name, values in arrays.items()
             if name.startswith("parameter ")
         }
-
-        def get(name: str, *shape: int) -> Array:
-            return arrays[name] if name in arrays else _everywhere(0.0, (n, *shape))
-
-        by_penalty = parameters.get("k_n", _everywhere(0.0, (n,)))
-        scalars = (
-            *("normal_reaction", "friction_bound_ratio", "circumradius", "friction_bound"),
-            *("bound_of_law", "friction_bound_slope", "dissipated", "multiplier", "depth"),
-        )
+        zero, zeros = (np.broadcast_to(0.0, shape) for shape in ((n,), (n, d)))
         vectors = ("slide", "traction", "increment", "old_traction", "elastic_slip")
-        always = (
-            *("x", "normal", "direction_length", "facing", "weight", "initial_gap", "shift"),
-            *("jump", "normal_displacement", "opening", "penetration", "normal_traction", "stored"),
-        )
+        found: dict[str, Any] = {field.name: zero for field in fields(cls)}
+        found |= dict.fromkeys(vectors, zeros) | {
+            "paired": np.broadcast_to(1.0, (n,)),
+            "normal_stiffness": parameters.get("k_n", zero),
+            "slip_increment": np.broadcast_to(0.0, (n, 0)),
+        }
+        found |= {name: arrays[name] for name in found if name in arrays}
         # With small displacements the history is in space.
         kept = {"foot": "jump", "framed_traction": "traction", "framed_normal": "normal"}
         kept |= {"carried_traction": "old_traction"}
-        return cls(
-            **{n: arrays[n] if n in arrays else get(other, d) for n, other in kept.items()},
-            **{name: arrays[name] for name in always},
-            **{name: get(name) for name in scalars},
-            **{name: get(name, d) for name in vectors},
-            parameters=parameters,
-            paired=arrays.get("paired", _everywhere(1.0, (n,))),
-            normal_stiffness=arrays.get("normal_stiffness", by_penalty),
-            slip_increment=get("slip_increment", 0),
-            arrays=arrays,
-        )
+        found |= {name: found[other] for name, other in kept.items() if name not in arrays}
+        return cls(**found | {"parameters": parameters, "arrays": arrays})
 
     def at(self, points: Mask) -> PointValues:
         """Those of some of the points."""
@@ -219,7 +198,7 @@ class PointValues:
         """K_t of a sticking point, (n_points, gdim, gdim) (stress/length)."""
         n, d = self.x.shape
         if "tangential_stiffness 0" not in self.arrays:
-            return _everywhere(0.0, (n, d, d))
+            return np.broadcast_to(0.0, (n, d, d))
         rows = [self.arrays[f"tangential_stiffness {i}"] for i in range(d)]
         return np.stack(rows, axis=1)
 
