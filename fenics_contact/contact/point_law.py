@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -56,11 +56,8 @@ class PointTangent:
         def times(values: Array) -> Array:
             return values * factor.reshape(-1, *[1] * (values.ndim - 1))
 
-        return PointTangent(
-            times(self.by_jump),
-            None if self.by_shift is None else times(self.by_shift),
-            None if self.spun is None else times(self.spun),
-        )
+        rest = (None if part is None else times(part) for part in (self.by_shift, self.spun))
+        return PointTangent(times(self.by_jump), *rest)
 
 
 class PointLaw:
@@ -113,8 +110,8 @@ class PointLaw:
     # ---- as UFL ----------------------------------------------------------------------------------
 
     def _there(self, value: Any) -> Any:
-        """A value at points at which the law acts, 0 at the others."""
-        return value if self._acts is None else self._acts * value
+        """A value at points at which the law acts, 0 at the others; None stays None."""
+        return value if self._acts is None or value is None else self._acts * value
 
     def _felt(self, jump: Any = None, seen: Seen | None = None) -> PointKinematics:
         jump = self._jump if jump is None else jump
@@ -123,20 +120,9 @@ class PointLaw:
     def _response(self, felt: PointKinematics, seen: Seen | None = None) -> ContactTraction:
         """What the law answers, nothing at points at which it does not act."""
         response = self.law.contact_traction(felt, (seen or self.seen).parameters)
-        if self._acts is None:
-            return response
-        there = self._there
-        return replace(
-            response,
-            normal_traction=there(response.normal_traction),
-            opening=there(response.opening),
-            penetration=there(response.penetration),
-            traction=None if response.traction is None else there(response.traction),
-            friction_bound=None
-            if response.friction_bound is None
-            else there(response.friction_bound),
-            slip=tuple(there(mode) for mode in response.slip),
-        )
+        parts = {f.name: getattr(response, f.name) for f in fields(response)}
+        slip = tuple(self._there(mode) for mode in parts.pop("slip"))
+        return replace(response, **{n: self._there(v) for n, v in parts.items()}, slip=slip)
 
     def traction(self, jump: Any, seen: Seen | None = None) -> Any:
         """r_n n + τ on the body, at a displacement (UFL)."""
@@ -146,10 +132,9 @@ class PointLaw:
         total = response.normal_traction * felt.normal
         return total if response.traction is None else total + response.traction
 
-    def potential(self, jump: Any = None, seen: Seen | None = None) -> Any:
+    def potential(self, jump: Any = None) -> Any:
         """Potential per area, at a displacement (UFL)."""
-        seen = seen or self.seen
-        return self._there(self.law.potential(self._felt(jump, seen), seen.parameters))
+        return self._there(self.law.potential(self._felt(jump), self.seen.parameters))
 
     # ---- as numbers ------------------------------------------------------------------------------
 
