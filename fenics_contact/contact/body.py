@@ -183,12 +183,9 @@ class FollowedOpposite(BodyOpposite):
         self._update_jump()
 
     def told(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
-        """See `Opposite`."""
-        return self._told_of_pairs(arrays)
-
-    def largest_slide(self, values: PointValues, of: PointValues | None = None) -> float:
-        """See `Opposite`."""
-        return 0.0
+        """See `Opposite`: ways are counted from the committed bodies, where they are none."""
+        foot = {"foot": np.zeros_like(arrays["jump"])} if self._parts.law.has_friction else {}
+        return self._told_of_pairs(arrays) | foot
 
     def tangent(self, law: PointLaw) -> PointTangent:
         """See `Opposite`."""

@@ -88,8 +88,7 @@ class PresentPairs(Pairs):
         felt: What laws see: "gap" (length), "normal", "slip" R (V - history) (length), "traction"
             from which the law's return map starts (stress).
         told: "jump", the displacement relative to the partner since the last commit (length);
-            "foot", nothing; "turn I", rows of R; "committed", R times the committed traction
-            (stress).
+            "turn I", rows of R; "committed", R times the committed traction (stress).
     """
 
     def __init__(
@@ -103,7 +102,7 @@ class PresentPairs(Pairs):
         self._before = u.copy()
         self.felt = PointFields(quadrature, {"gap": 0, "normal": d, "slip": d, "traction": d})
         turns = {f"turn {i}": d for i in range(d)}
-        self.told = PointFields(quadrature, {"jump": d, "foot": d, "committed": d} | turns)
+        self.told = PointFields(quadrature, {"jump": d, "committed": d} | turns)
         self._where: tuple[Array, Array] | None = None
         self._at_rest: tuple[Array, Array] | None = None
         self._committed: _Committed | None = None
@@ -167,12 +166,11 @@ class PresentPairs(Pairs):
         if self.number == 1:
             self._warn_of_unpaired(hits.reason)
         self._local = None
-        none, committed = np.zeros_like(normal), np.zeros_like(normal)
+        committed = np.zeros_like(normal)
         if "traction" in history:
             committed = self.turned(history.values("traction"))
         turns = {f"turn {i}": rotation[:, i] for i in range(self._gdim)}
-        told = {"jump": self._jump_since(), "foot": none, "committed": committed}
-        self.told.assign(told | turns)
+        self.told.assign({"jump": self._jump_since(), "committed": committed} | turns)
 
     def _jump_since(self) -> Array:
         """Displacement relative to the partner since the last commit, (n_points, d). Collective."""
@@ -251,10 +249,6 @@ class PresentPairs(Pairs):
     def true_gap(self, values: PointValues) -> tuple[Array, Array]:
         """See `Opposite.true_placement`: it is that of the pairs themselves."""
         return np.where(self.paired, values.gap, np.nan), values.normal.copy()
-
-    def linear_gap(self, values: PointValues) -> Array:
-        """See `Pairs.linear_gap`: nothing is linearised."""
-        return self.true_gap(values)[0]
 
     # ---- derivatives -----------------------------------------------------------------------------
 
@@ -400,7 +394,6 @@ class PresentKinematics:
         told = {"normal": felt.normal, "jump": self._told.ufl("jump")}
         if law.has_friction:
             told |= {
-                "foot": self._told.ufl("foot"),
                 "framed_normal": self.framed(felt.normal),
                 "framed_traction": self.framed(response.traction),
                 "carried_traction": tangential(self._told.ufl("committed"), felt.normal),
