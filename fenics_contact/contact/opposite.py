@@ -385,21 +385,19 @@ class Opposite(ABC):
         turn = self.rotation_in_increment(values)
         return ObstacleMotion(self.committed_offset(values), turn, self.present_jump())
 
-    def angle(self, values: PointValues) -> float:
-        """By which the obstacle has turned since it began, 0 where it cannot (radians).
+    def angle(self, values: PointValues | None = None) -> float:
+        """By which the obstacle has turned since it began, 0 where it cannot (radians). Collective.
 
-        Collective.
+        Args:
+            values: When; by default with the data as they were sampled last.
         """
-        return self._angle(values.arrays)
-
-    def _angle(self, arrays: Mapping[str, Array]) -> float:
-        """`angle`, of arrays at the points. Collective."""
         inputs = self._parts.inputs
         if inputs.free_angle is not None:
             return float(inputs.free_angle.value)
         if inputs.angle is None:
             return 0.0
         # The same at all points.
+        arrays = self.data.values if values is None else values.arrays
         return global_max(self._mesh.comm, arrays["angle"])
 
     def turned_by(self, values: PointValues) -> float:
@@ -423,17 +421,13 @@ class Opposite(ABC):
         raise ValueError(f"{self._parts.name}: the obstacle has no displacement")
 
     def turning_rate(self) -> Array:
-        """Way by a unit angle of the obstacle's points where those of Γc are now. Collective.
+        """Way by a unit angle of a turning obstacle's points where those of Γc are now. Collective.
 
         Returns:
             ω × r, with r from the axis as it is now, (n_points, gdim) (length).
-
-        Raises:
-            ValueError: The obstacle does not turn.
         """
         rotation = self._parts.obstacle.rotation
-        if rotation is None:
-            raise ValueError(f"{self._parts.name}: the obstacle has no Rotation")
+        assert rotation is not None
         jump = self.present_jump()
         self.update_data()
         data = self.data.values
@@ -448,17 +442,6 @@ class Opposite(ABC):
             (n_points,); 0 of a gap that is given on Γc, and between bodies.
         """
         return np.zeros(len(values.x))
-
-    def curvature(self) -> Array:
-        """Second derivatives of the distance at X + u, (n_points, gdim, gdim) (1/length).
-
-        Raises:
-            ValueError: Displacements are taken as small, or it is no rigid obstacle.
-        """
-        raise ValueError(
-            f"{self._parts.name}: the curvature is available with a rigid obstacle and "
-            'kinematics="finite" only'
-        )
 
     def in_frame(self, vectors: Array, angle: float) -> Array:
         """Vectors in the frame of the obstacle turned by an angle since it began, (n, gdim)."""

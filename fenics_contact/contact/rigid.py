@@ -175,7 +175,7 @@ class MovingOpposite(Opposite):
         way = self.turned(values.jump - self._view.values("relative"))
         rotation = self._parts.obstacle.rotation
         if rotation is not None:
-            turn = self._angle(self.data.values) - self.angle(values)
+            turn = self.angle() - self.angle(values)
             traction = rotation.turned(traction, turn)
         return way, traction
 
@@ -186,15 +186,11 @@ class MovingOpposite(Opposite):
         error = self._view.values("slope") + self._view.values("normal")
         return np.asarray(np.linalg.norm(error, axis=1))
 
-    def curvature(self) -> Array:
+    def largest_curvature(self) -> Array:
         """See `Opposite`."""
         turns = [self._view.values(f"turn {i}") for i in range(self._gdim)]
         by_place = -np.stack(turns, axis=1)
-        return np.asarray(by_place + by_place.swapaxes(1, 2)) / 2
-
-    def largest_curvature(self) -> Array:
-        """See `Opposite`."""
-        curvature = self.curvature()
+        curvature = (by_place + by_place.swapaxes(1, 2)) / 2
         largest = np.full(len(curvature), np.inf)
         known = np.isfinite(curvature).all(axis=(1, 2))
         largest[known] = np.linalg.eigvalsh(curvature[known]).max(axis=1, initial=0.0)
