@@ -48,36 +48,25 @@ class LoadBalance:
         """Find the rigid-body modes that are free with the present data of the bulk. Collective.
 
         Args:
-            full: The system on all unknowns.
+            full: The system on all unknowns, its contacts evaluated.
 
         Raises:
-            ValueError: Nothing will ever hold one of them.
-        """
-        with full.stiffness_at_rest() as stiffness:
-            full.scales.measure_stiffness(stiffness)
-            self._modes.find_free(stiffness, full.constrained)
-        self.check_constraints(full.operators)
-        full.bulk.note_data()
-
-    def check_constraints(self, operators: Sequence[ContactOperator]) -> None:
-        """Refuse a free mode that no contact resists, even if all of Γc were closed. Collective.
-
-        Args:
-            operators: Of evaluated contacts, over all unknowns.
-
-        Raises:
-            ValueError: It names the mode.
+            ValueError: No contact resists one of them, even if all of Γc were closed; it names it.
         """
         modes = self._modes
-        loose = modes.unconstrained(operators, closed_only=False) @ modes.free
+        with full.stiffness_at_rest() as stiffness:
+            full.scales.measure_stiffness(stiffness)
+            modes.find_free(stiffness, full.constrained)
+        loose = modes.unconstrained(full.operators, closed_only=False) @ modes.free
         if loose.size:
             motions = "; ".join(modes.describe(row) for row in loose)
-            finite = any(operator.contact.finite for operator in operators)
+            finite = any(contact.finite for contact in full.contacts)
             order = " to first order" if finite else ""
             raise ValueError(
                 f"neither Dirichlet conditions nor contact constrain this rigid-body mode{order}: "
                 f"{motions}. Add a Dirichlet condition that constrains it, or friction"
             )
+        full.bulk.note_data()
 
     def check(self, load: Array, operators: Sequence[ContactOperator]) -> None:
         """Refuse a load whose resultant no admissible contact forces can balance. Collective.
