@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dolfinx import fem
 
-from fenics_contact.contact.opposite import Opposite
+from fenics_contact.contact.opposite import Opposite, Parts
 from fenics_contact.contact.point_law import PointLaw, PointTangent
-from fenics_contact.laws.base import Law
-from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.types import Array, Mask
 
 __all__ = ["ActingLaw"]
@@ -22,14 +20,14 @@ class ActingLaw:
         has_potential: Whether its tractions follow from a potential, and the tangent is symmetric.
     """
 
-    def __init__(self, law: Law, opposite: Opposite, quadrature: SurfaceQuadrature) -> None:
+    def __init__(self, parts: Parts, opposite: Opposite) -> None:
         """Compile what evaluates all of it. Collective.
 
         Args:
-            law: The law.
+            parts: Of the contact.
             opposite: What its points feel.
-            quadrature: These.
         """
+        law, quadrature = parts.law, parts.quadrature
         self._law, self._opposite, self._quadrature = law, opposite, quadrature
         self._within = fem.Function(quadrature.space(), name="within")
         self._within.x.array[:] = 1.0

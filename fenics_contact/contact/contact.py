@@ -198,13 +198,11 @@ class Contact(PointResults):
             multipliers=None if self.multipliers is None else self.multipliers.fields,
         )
         self.opposite: Opposite = opposite_kind(parts)
-        self.acting = ActingLaw(law, self.opposite, self.quadrature)
+        self.acting = ActingLaw(parts, self.opposite)
         if not self.rigid:
             self.opposite.update()
             self.opposite.find_pairs(None, np.zeros(self.quadrature.n_points))
-        self.states = ContactStates(
-            name, law, self.history, self.multipliers, self.opposite, self.acting
-        )
+        self.states = ContactStates(parts, self.multipliers, self.opposite, self.acting)
 
     # ---- forms -----------------------------------------------------------------------------------
 

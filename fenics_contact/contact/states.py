@@ -10,10 +10,8 @@ import numpy as np
 
 from fenics_contact.contact.acting import ActingLaw
 from fenics_contact.contact.multipliers import Multipliers
-from fenics_contact.contact.opposite import Opposite, OppositeState
+from fenics_contact.contact.opposite import Opposite, OppositeState, Parts
 from fenics_contact.contact.values import PointValues
-from fenics_contact.laws.base import Law
-from fenics_contact.surface.fields import PointFields
 from fenics_contact.types import Array, Mask
 
 __all__ = ["ContactState", "ContactStates", "ContactTrial"]
@@ -67,9 +65,7 @@ class ContactStates:
 
     def __init__(
         self,
-        name: str,
-        law: Law,
-        history: PointFields,
+        parts: Parts,
         multipliers: Multipliers | None,
         opposite: Opposite,
         acting: ActingLaw,
@@ -77,15 +73,13 @@ class ContactStates:
         """Begin at the present ``u``. Collective.
 
         Args:
-            name: Of the contact.
-            law: The contact law.
-            history: Fields for the history variables.
+            parts: Of the contact.
             multipliers: Of the augmented Lagrangian method.
             opposite: The contact kinematics.
             acting: The law evaluated at the points.
         """
-        self.history = history
-        self._name, self._law, self._multipliers = name, law, multipliers
+        self.history = history = parts.history
+        self._name, self._law, self._multipliers = parts.name, parts.law, multipliers
         self._opposite, self._acting = opposite, acting
         self._values: PointValues | None = None
         opposite.begins_anew()
