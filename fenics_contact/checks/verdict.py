@@ -385,7 +385,8 @@ def check_laws(contact: Contact) -> dict[str, float]:
         return found
 
     bound, beta = v.friction_bound, v.slip_increment
-    functions, gradients = (rows[paired] for rows in contact.evaluate_yield())
+    contact.opposite.update()
+    functions, gradients = (rows[paired] for rows in contact.acting.own.evaluate_yield())
     missing = contact.slip_vector()[paired]  # = -Σ Δβ_j ∂g_j/∂τ (44)
     change = missing - v.increment
     # An open point keeps no traction and counts no slip, whatever it moves.

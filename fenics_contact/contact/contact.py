@@ -9,7 +9,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from fenics_contact.arguments import check_instance, is_built_in
+from fenics_contact.arguments import check_instance
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.acting import ActingLaw
 from fenics_contact.contact.choices import enforcement_of, kind_of_opposite
@@ -21,7 +21,7 @@ from fenics_contact.contact.results import PointResults
 from fenics_contact.contact.states import ContactStates
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law
-from fenics_contact.obstacles.base import Obstacle, SampledObstacle
+from fenics_contact.obstacles.base import Obstacle
 from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.surface.displacement import Displacement, check_kind
 from fenics_contact.surface.facet_places import FacetPlaces
@@ -352,29 +352,6 @@ class Contact(PointResults):
         self.states.forget()
         self.inputs.check(self.opposite.data.values, undeformed=not self.finite)
 
-    def given(self) -> dict[str, Array]:
-        """Return the data of law, obstacle and contact at this rank's points, by name. Collective.
-
-        The results of the last evaluation are not changed.
-        """
-        self.inputs.update()
-        self.opposite.update_data()
-        data = self.opposite.data.values
-        names = ["weight", "normal", "shift", "turn", "about", "axis"]
-        # Else it is that of the latest pairs.
-        if self.gap_prescribed or not self.opposite.may_pair_anew:
-            names.append("initial_gap")
-        return {n: v for n, v in data.items() if n in names or n.startswith("parameter ")}
-
-    def reads(self, constant: fem.Constant) -> bool:
-        """Return whether law, obstacle, gap or weight depend on a constant.
-
-        Returns True if that cannot be decided: for a `SampledObstacle` and for user-defined laws.
-        """
-        seen = is_built_in(self.law) and not isinstance(self.obstacle, SampledObstacle)
-        loads = [motion.load() for motion in self.motions]
-        return not seen or self.opposite.data.reads(constant) or any(f is constant for f in loads)
-
     # ---- pairs -----------------------------------------------------------------------------------
 
     @property
@@ -386,11 +363,6 @@ class Contact(PointResults):
     def pairs(self) -> Pairs:
         """The pairs of points of Γc and opposite points."""
         return self.opposite.pairs
-
-    @property
-    def couples(self) -> bool:
-        """Whether contact couples unknowns that the bulk does not couple."""
-        return not self.rigid or bool(self.motions)
 
     @property
     def paired(self) -> Mask:
@@ -456,15 +428,6 @@ class Contact(PointResults):
     def commit(self) -> None:
         """Make the state at the present ``u`` the history of the next increment. Collective."""
         self.states.commit()
-
-    def evaluate_yield(self) -> tuple[Array, Array]:
-        """Evaluate the law's yield functions and their gradients at the present ``u``. Collective.
-
-        Returns:
-            g_j(τ, bound) (stress), (n_points, n_modes), and ∂g_j/∂τ, (n_points, n_modes, gdim).
-        """
-        self.opposite.update()
-        return self.acting.own.evaluate_yield()
 
     def enforcement_error(self) -> float:
         """Return the traction that is left to the penalty, relative to the largest. Collective.

@@ -27,6 +27,7 @@ from fenics_contact.histories.archive import (
 )
 from fenics_contact.histories.fingerprint import (
     changed_data,
+    data_of,
     data_words,
     fixed_words,
     probe,
@@ -119,10 +120,10 @@ def save(
     scene: dict[str, Any] = {"format": FORMAT, "notes": notes, "contacts": {}}
     scene["fixed"], scene["data"] = fixed_words(problem, state_fields), data_words(problem)
     for contact in problem.contacts:
-        given, values = contact.given(), dict(contact.values.arrays)
-        scene["contacts"][contact.name] = layout_of(given), layout_of(values)
+        data, values = data_of(contact), dict(contact.values.arrays)
+        scene["contacts"][contact.name] = layout_of(data), layout_of(values)
         places = point_places(contact)
-        arrays[f"contact {contact.name}"] = gather(comm, places, contact.history.rows(), given)
+        arrays[f"contact {contact.name}"] = gather(comm, places, contact.history.rows(), data)
         arrays[f"values {contact.name}"] = gather(comm, places, values)
     for number, field in enumerate(state_fields):
         arrays[f"field {number}"] = gather(comm, node_places(field.function_space), rows_of(field))

@@ -24,7 +24,7 @@ from fenics_contact.problem import ContactProblem
 from fenics_contact.systems.committed import N_ROWS, CommittedState
 from fenics_contact.types import Array
 
-__all__ = ["changed_data", "data_words", "fixed_words", "probe", "why_another_scene"]
+__all__ = ["changed_data", "data_of", "data_words", "fixed_words", "probe", "why_another_scene"]
 
 # Relative difference up to which data are the same, and, of lengths, relative to the mesh: the gap
 # to an obstacle is a difference of coordinates.
@@ -248,9 +248,24 @@ def _compare_conditions(problem: ContactProblem, committed: CommittedState) -> l
     )
 
 
+def data_of(contact: Contact) -> dict[str, Array]:
+    """The data of law, obstacle and contact at this rank's points, by name. Collective.
+
+    The results of the last evaluation are not changed.
+    """
+    contact.inputs.update()
+    contact.opposite.update_data()
+    data = contact.opposite.data.values
+    names = ["weight", "normal", "shift", "turn", "about", "axis"]
+    # Else it is that of the latest pairs.
+    if contact.gap_prescribed or not contact.opposite.may_pair_anew:
+        names.append("initial_gap")
+    return {n: v for n, v in data.items() if n in names or n.startswith("parameter ")}
+
+
 def _compare_points(contact: Contact, theirs: dict[str, Array], size: float) -> list[str]:
     """Data at the points."""
-    comm, ours = contact.surface.mesh.comm, contact.given()
+    comm, ours = contact.surface.mesh.comm, data_of(contact)
     missing = [f"data of {contact.name}, {_named(theirs)} in the file and {_named(ours)} here"] * (
         theirs.keys() != ours.keys()
     )

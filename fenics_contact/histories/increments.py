@@ -13,13 +13,15 @@ import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 
-from fenics_contact.arguments import check_bool, check_instance
+from fenics_contact.arguments import check_bool, check_instance, is_built_in
+from fenics_contact.contact.contact import Contact
 from fenics_contact.estimates.errors import quantities
 from fenics_contact.failure import NotConverged
 from fenics_contact.histories import checkpoint as states
 from fenics_contact.histories.progress import Bar
 from fenics_contact.histories.table import Table
 from fenics_contact.methods.attempt import Attempt
+from fenics_contact.obstacles.base import SampledObstacle
 from fenics_contact.parallel import collective_errors, global_sum, warn
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import files
@@ -195,7 +197,9 @@ def reads(problem: ContactProblem, constant: fem.Constant) -> bool:
     Collective.
     """
     full = problem.full
-    if constant in full.bulk.form.constants() or any(c.reads(constant) for c in problem.contacts):
+    if constant in full.bulk.form.constants():
+        return True
+    if any(_contact_reads(contact, constant) for contact in problem.contacts):
         return True
     value, prescribed = constant.value.copy(), list[Array]()
     try:
@@ -205,6 +209,16 @@ def reads(problem: ContactProblem, constant: fem.Constant) -> bool:
     finally:
         constant.value = value
     return bool(full.unknowns.comm.allreduce(int(not np.array_equal(prescribed[0], prescribed[1]))))
+
+
+def _contact_reads(contact: Contact, constant: fem.Constant) -> bool:
+    """Return whether law, obstacle, gap or weight depend on a constant.
+
+    Returns True if that cannot be decided: for a `SampledObstacle` and for user-defined laws.
+    """
+    seen = is_built_in(contact.law) and not isinstance(contact.obstacle, SampledObstacle)
+    loads = [motion.load() for motion in contact.motions]
+    return not seen or contact.opposite.data.reads(constant) or any(f is constant for f in loads)
 
 
 def _check_constant(problem: ContactProblem, load: fem.Constant, start: float, end: float) -> None:

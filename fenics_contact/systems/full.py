@@ -257,7 +257,7 @@ class FullSystem(System):
         than what contact couples now. In space open points that count as coupled cost up to half of
         it, a new pattern a tenth; in the plane that is the larger part.
         """
-        couples = self.gdim == 3 and any(c.couples for c in self.contacts)
+        couples = self.gdim == 3 and any(_couples(c) for c in self.contacts)
         return self.follows or (couples and self.linear_kind == "direct")
 
     def matrix(self, *, symmetric: bool) -> PETSc.Mat:
@@ -269,7 +269,7 @@ class FullSystem(System):
         different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
         matrix = self.stiffness.copy()
         for operator in self.operators:
-            if operator.contact.couples and not self.pattern_changes:
+            if _couples(operator.contact) and not self.pattern_changes:
                 part = operator.springs(operator.contact.values.springs(1.0, 1.0))
                 matrix.axpy(1.0, part, different)
                 part.destroy()
@@ -303,7 +303,7 @@ class FullSystem(System):
             total.destroy()
         else:
             subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
-            if any(c.couples for c in self.contacts):
+            if any(_couples(c) for c in self.contacts):
                 matrix.zeroEntries()
                 matrix.axpy(1.0, self.stiffness, subset)
             else:
@@ -324,6 +324,11 @@ class FullSystem(System):
         """See `System.bulk_diagonal`."""
         assert self.stiffness is not None
         return _diagonal(self.stiffness)
+
+
+def _couples(contact: Contact) -> bool:
+    """Whether a contact couples unknowns that the bulk does not couple."""
+    return not contact.rigid or bool(contact.motions)
 
 
 def _diagonal(matrix: PETSc.Mat) -> Array:
