@@ -309,7 +309,7 @@ class IncrementSolver:
             nothing = Forces.none(np.zeros(1), np.zeros(1, dtype=np.intp))
             began = began.with_forces(mark, nothing)
         if points.replaced:
-            began = began.between([c.opposite.committed_jump for c in self._contacts])
+            began = began.between(self._contacts)
         return energies.since(began, self._contacts, self._full.scales)
 
     def _judge_all(

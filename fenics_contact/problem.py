@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -284,10 +284,9 @@ class ContactProblem:
         self.complete()
         return self.full.state()
 
-    @contextmanager
     def linearised(
         self, springs: Sequence[Array]
-    ) -> Iterator[Callable[[Sequence[Array] | None], Array]]:
+    ) -> AbstractContextManager[Callable[[Sequence[Array] | None], Array]]:
         """Solve linear systems with the tangent of the bulk and given contact stiffness.
 
         The tangent is that of the present state. Collective.
@@ -296,14 +295,13 @@ class ContactProblem:
             springs: Stiffness at the points of every contact, (n_points, gdim, gdim)
                 (stress/length).
 
-        Yields:
-            A collective function that returns the change of this rank's unknowns. Its argument is
-            either the tractions added on the body, one array (n_points, gdim) per contact, or None:
-            then the right-hand side is the present residual.
+        Returns:
+            For a ``with`` block, a collective function that returns the change of this rank's
+            unknowns. Its argument is either the tractions added on the body, one array (n_points,
+            gdim) per contact, or None: then the right-hand side is the present residual.
         """
         self.complete()
-        with self.solver.linearised(springs, self._present.load) as solve:
-            yield solve
+        return self.solver.linearised(springs, self._present.load)
 
     # ---- solving ---------------------------------------------------------------------------------
 
@@ -352,6 +350,13 @@ class ContactProblem:
         start_unknowns, diagonal = self.full.state(), self.full.diagonal.copy()
         at_present = self._is_present(start_unknowns)
         self._take_committed_pairs()
+
+        def back() -> None:
+            # What it starts from may have been completed meanwhile.
+            self._go_back(self._present.unknowns if at_present else start_unknowns)
+            if not self.full.bulk.linear:  # that of a failure would excuse any residual
+                self.full.diagonal = diagonal.copy()
+
         try:
             # A trial of a line search may overflow, and the convergence test and the verdict see
             # it: a warning, on the rank that has the point, must not become an error there alone.
@@ -363,12 +368,9 @@ class ContactProblem:
                         break
                     if found is Again.PAIRS:
                         self._find_pairs(points)
-                    # What it starts from may have been completed meanwhile.
-                    self._go_back(self._present.unknowns if at_present else start_unknowns)
+                    back()
                     self._take_committed_pairs()
                     points.begin(self.contacts)
-                    if not self.full.bulk.linear:  # that of a failure would excuse any residual
-                        self.full.diagonal = diagonal.copy()
                     # Outside, lest a SNES that is made anew takes its options for the caller's.
                     if found is Again.UNKNOWNS:
                         spread = sum(each.outcome == found.value for each in increment.tried)
@@ -376,9 +378,7 @@ class ContactProblem:
                 release_interrupt()
         except BaseException as error:
             fail_together(self._comm, error)
-            self._go_back(self._present.unknowns if at_present else start_unknowns)
-            if not self.full.bulk.linear:  # that of cells near collapse would excuse any residual
-                self.full.diagonal = diagonal
+            back()
             if not isinstance(error, NotConverged | ValueError):
                 self.solver.recover()
             raise
@@ -518,7 +518,7 @@ class ContactProblem:
             unknowns=self.full.state(),
             contacts=tuple(contact.states.committed for contact in self.contacts),
             load=trial.load,
-            energy=trial.energy.between([c.opposite.committed_jump for c in self.contacts]),
+            energy=trial.energy.between(self.contacts),
             change=trial.unknowns - start.unknowns if complete else None,
             load_change=trial.load - start.load,
             interior=trial.interior,
@@ -618,7 +618,7 @@ class ContactProblem:
             unknowns=taken.state.copy(),
             contacts=tuple(contact.states.committed for contact in self.contacts),
             load=load,
-            energy=energy.between([c.opposite.committed_jump for c in self.contacts]),
+            energy=energy.between(self.contacts),
             change=taken.change.copy() if global_max(self._comm, np.abs(taken.change)) else None,
             load_change=taken.load_change.copy(),
             increment=taken.increment,

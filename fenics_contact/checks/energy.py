@@ -95,10 +95,11 @@ class EnergyState:
         """Return this state with the forces in other coordinates, too."""
         return dataclasses.replace(self, forces={**self.forces, mark: forces})
 
-    def between(self, jumps: Sequence[Array]) -> EnergyState:
-        """Return this state with relative displacements of new pairs."""
+    def between(self, contacts: Sequence[Contact]) -> EnergyState:
+        """Return this state, the committed one, with relative displacements of the new pairs."""
         ways = [
-            np.stack([w[0], jump, *w[2:]]) for w, jump in zip(self.contacts, jumps, strict=True)
+            np.stack([way[0], contact.opposite.committed_jump, *way[2:]])
+            for way, contact in zip(self.contacts, contacts, strict=True)
         ]
         return dataclasses.replace(self, contacts=ways)
 
