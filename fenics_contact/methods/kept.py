@@ -28,19 +28,19 @@ class Kept:
 
     Attributes:
         indices: This rank's, ascending.
+        chosen: Whether they were chosen where the first increment starts, or given for it.
     """
 
-    def __init__(self, full: FullSystem, size: float, *, all_that_pay: bool) -> None:
+    def __init__(self, full: FullSystem, *, all_that_pay: bool) -> None:
         """Choose them at the present state. Collective.
 
         Args:
             full: The system on all unknowns.
-            size: Of the mesh (length).
             all_that_pay: Whether to keep however many there are, since the caller says so.
         """
-        self._full, self._size, self._all_that_pay = full, size, all_that_pay
+        self._full, self._all_that_pay = full, all_that_pay
         self.indices = self._nearest()
-        self._chosen = False  # where the first increment starts
+        self.chosen = False
         # For `change`: those to be kept, or how far points of the last solution were from bearing.
         self._next: Indices | None = None
         self._away: list[Array] | None = None
@@ -85,7 +85,7 @@ class Kept:
             self._full.unknowns,
             away,
             max(at_least, for_nothing),
-            NEGLIGIBLE * self._size,
+            NEGLIGIBLE * self._full.scales.mesh_size,
         )
 
     def _grown(self, away: Sequence[Array] | None, *, anew: bool) -> Indices:
@@ -133,8 +133,8 @@ class Kept:
         """
         comm = self._full.unknowns.comm
         self._next = None
-        if not self._chosen:
-            self._chosen, found = True, self._nearest()
+        if not self.chosen:
+            self.chosen, found = True, self._nearest()
             if comm.allreduce(int(not np.array_equal(found, self.indices))):
                 self._next = found
         elif other_pairs and not self.is_all:
@@ -166,11 +166,3 @@ class Kept:
             anew: Whether those kept now may be dropped where they would be too many.
         """
         self.indices = self._grown(self._away, anew=anew) if self._next is None else self._next
-
-    def take(self, indices: Indices) -> None:
-        """Keep these."""
-        self.indices = indices
-
-    def was_chosen(self) -> None:
-        """Take what is kept for chosen, where no first increment starts."""
-        self._chosen = True

@@ -162,7 +162,7 @@ class Solver:
         self._comm = full.unknowns.comm
         self._obstacle: str | None = None  # to condensation, as last said
         self._pairings = self._present_pairings()  # those of the system
-        self._kept = Kept(full, full.scales.mesh_size, all_that_pay=bool(settings.condensation))
+        self._kept = Kept(full, all_that_pay=bool(settings.condensation))
         # What is chosen and made by `_configure`, for the increments that are expected.
         self.options = Defaults()
         self._named: list[str] = []  # options given that name a linear solver
@@ -350,7 +350,6 @@ class Solver:
             if not self.condensed or self._kept.grows():
                 self._set_system()
             self._pairings = self._present_pairings()
-            self.snes.reset()
             self._make_matrices()
         if stiffness_changed or not self.system.ready:
             self.equations.factorisations += self.system.update()
@@ -390,7 +389,6 @@ class Solver:
             self._configure_anew()
         elif self.condensed:
             self._set_system()
-            self.snes.reset()
             self._make_matrices()
 
     def keep(self, kept: Indices) -> None:
@@ -398,13 +396,12 @@ class Solver:
         some = self._comm.allreduce(kept.size) > 0
         anew = some != self.condensed and self._settings.condensation is None
         if some and self.condensed:
-            self._kept.take(kept)
+            self._kept.indices = kept
             self._set_system()
-            self.snes.reset()
         elif anew and not self._kept.is_all:
-            self._kept.take(kept if some else self._kept.touched())
+            self._kept.indices = kept if some else self._kept.touched()
             self._configure_anew()
-        self._kept.was_chosen()
+        self._kept.chosen = True
 
     def restart(self) -> None:
         """Drop what is kept from earlier increments. Collective."""
@@ -414,11 +411,11 @@ class Solver:
     def recover(self) -> None:
         """Replace what an error of PETSc may have left locked or half done. Collective."""
         self.equations.take(self.system)
-        self.snes.reset()
         self._make_matrices()
 
     def _make_matrices(self) -> None:
         """New matrices for new couplings, or to forget all that was factored. Collective."""
+        self.snes.reset()
         self._forget_matrices()
         self.main.attach(consistent=not self._quasi_newton)
 
