@@ -180,8 +180,7 @@ class IncrementSolver:
         interior = solver.system.pending_field if lags else None
         if not lags:
             solver.system.complete(solver.system.pending_field)
-        for contact in self._contacts:
-            contact.evaluate()
+        self._full.evaluate()
         part = solver.system.part if lags else np.asarray
         if reason > 0 and move_unloaded_bodies(solver.equations, part) and solver.starts.factored:
             solver.starts.note_borne()

@@ -191,8 +191,7 @@ class ContactProblem:
             balance=balance,
             prefix=prefix,
         )
-        for contact in self.contacts:
-            contact.evaluate()
+        self.full.evaluate()
         self.state = self._initial_state()
         self._trial: Trial | None = None
         self._fresh = True  # nothing was solved yet

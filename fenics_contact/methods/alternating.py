@@ -172,10 +172,9 @@ class Alternation(OwnMethod):
 
     def _friction_bound(self) -> Array:
         """Friction bound of all contacts at this rank's points (stress)."""
-        contacts = self._equations.contacts
-        for contact in contacts:
-            contact.evaluate()
-        return np.concatenate([contact.values.friction_bound for contact in contacts])
+        equations = self._equations
+        equations.full.evaluate()
+        return np.concatenate([contact.values.friction_bound for contact in equations.contacts])
 
     def _residual(self) -> float:
         """That of the whole law."""

@@ -86,8 +86,7 @@ class Approach:
         full, motions = self._full, self._motions
         if not len(motions.free):
             return first
-        for contact in full.contacts:
-            contact.evaluate()
+        full.evaluate()
         finite = all(contact.finite for contact in full.contacts)
         groups, load_size = motions.groups(), motions.generalised_load(load)
         borne = full.contact_force_sizes(committed=finite)

@@ -268,8 +268,7 @@ class Equations:
         self.set_state(x)
         if not self._bulk.linear:  # else nothing changes it during a solution
             self.full.update_stiffness()
-        for contact in self.contacts:
-            contact.evaluate()
+        self.full.evaluate()
 
     def note(self) -> None:
         """Let `watch` see the status of the points, evaluated where `norms` are from."""

@@ -60,9 +60,7 @@ class FirstTouch:
         if not parts:
             return
         present = full.state()
-        full.set_state(start)
-        for contact in {id(part.contact): part.contact for part in parts}.values():
-            contact.evaluate()
+        full.evaluate_at(start)
         ways = [part.contact.opposite.committed_offset(part.contact.values) for part in parts]
         apart = [given for given in zip(parts, ways, strict=True) if self._is_apart(*given)]
         full.set_state(present)
@@ -77,9 +75,7 @@ class FirstTouch:
                     path.gap(share)
                     path.part.contact.states.count_slip_from_here(path.part.points)
             self.end = end if shares.min() == 1.0 else None
-        full.set_state(present)
-        for contact in full.contacts:
-            contact.evaluate()
+        full.evaluate_at(present)
 
     def _parts(self) -> list[_Part]:
         """The contacts with friction, each divided by groups of coupled bodies. Collective."""

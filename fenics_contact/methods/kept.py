@@ -76,8 +76,7 @@ class Kept:
         if self._is_little(everything):
             return everything
         if away is None:
-            for contact in self._full.contacts:
-                contact.evaluate()
+            self._full.evaluate()
             away = [distances(contact) for contact in self._full.contacts]
         for_nothing = inexpensive(self._full.unknowns.n_global, self._full.gdim)
         return nearest(

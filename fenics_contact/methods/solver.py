@@ -520,8 +520,7 @@ class Solver:
         x.array[:] = start
         equations.set_state(x)
         x.destroy()
-        for contact in self._full.contacts:
-            contact.evaluate()
+        self._full.evaluate()
         if balance and not self._full.bulk.linear:
             LoadBalance(equations.motions).check(self._full.load, self._full.operators)
         if not goes_on:
@@ -590,8 +589,7 @@ class Solver:
                     moved = present - start
                     full.set_state(start)
                     full.update_stiffness()
-                for contact in full.contacts:
-                    contact.evaluate()
+                full.evaluate()
                 largest = global_max(self._comm, np.abs(self.system.contact_force()))
                 if not (np.isfinite(largest) and self.equations.is_constrained()):
                     return None

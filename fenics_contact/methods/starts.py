@@ -217,8 +217,7 @@ class Starts:
         full.update_stiffness()
         ksp = equations.solvers[True]
         if anew:
-            for contact in full.contacts:
-                contact.evaluate()
+            full.evaluate()
             matrix = equations.matrix(True)
             equations.assemble(matrix, equations.regularised_tangents())
         assert full.stiffness is not None

@@ -140,6 +140,10 @@ class FullSystem(System):
     def evaluate_at(self, state: Array) -> None:
         """Make a state the present one, and evaluate the contacts there. Collective."""
         self.set_state(state)
+        self.evaluate()
+
+    def evaluate(self) -> None:
+        """Evaluate the contacts at the present state. Collective."""
         for contact in self.contacts:
             contact.evaluate()
 
