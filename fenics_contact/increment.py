@@ -17,7 +17,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.failure import NotConverged
 from fenics_contact.methods.approach import Approach
 from fenics_contact.methods.attempt import Attempt
-from fenics_contact.methods.first_touch import FirstTouch
+from fenics_contact.methods.first_touch import count_slip_from_touch
 from fenics_contact.methods.load_balance import LoadBalance
 from fenics_contact.methods.opposite_points import OppositePoints
 from fenics_contact.methods.solver import Solver
@@ -98,7 +98,6 @@ class IncrementSolver:
         self._bulk, self._contacts, self._comm = full.bulk, full.contacts, full.unknowns.comm
         self._u = full.displacement.whole
         self._approach = Approach(full, solver.equations.motions)
-        self._first_touch = FirstTouch(full)
 
     # ---- what is given ---------------------------------------------------------------------------
 
@@ -164,9 +163,9 @@ class IncrementSolver:
         solver.system.begin(load)
         solver.equations.began = state.unknowns
         led = np.where(self._full.constrained, before, self._full.state())
-        self._first_touch.count_slip(led, solver.end_without)
+        end = count_slip_from_touch(self._full, led, solver.end_without)
         solver.starts.change = state.change
-        solver.starts.expected = self._first_touch.end if points.end is None else points.end
+        solver.starts.expected = end if points.end is None else points.end
         with solver.system.acting():
             reason, attempts, rounds = solver.solve(
                 cold=cold,

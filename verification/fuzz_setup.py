@@ -16,6 +16,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import compat
+from fenics_contact.contact.opposite import ObstacleMotion
 from fenics_contact.types import Array
 from verification import fuzz_features, fuzz_forms
 from verification.fuzz_scenes import TOP, Scene, frictions
@@ -549,36 +550,37 @@ def _gather_displacement(setup: SceneSetup, u: fem.Function | None = None) -> np
 
 def _record_slip_resets(setup: SceneSetup, contact: fc.Contact) -> None:
     """Record the calls by which a contact moves its slip reference, or finds other pairs."""
+    positions: list[bool] = []  # whether obstacles are where they were: then bodies are positioned
 
-    def wrap(method: Any, *, rigid: bool) -> Any:
-        def wrapped(*given: Any, **options: Any) -> None:
-            if rigid and not any(setup.comm.allgather(bool(given[0].any()))):
-                method(*given, **options)  # other bodies are positioned
-                return
-            unloaded = given[0]
-            if rigid:
-                unloaded = unloaded & (contact.history.values("normal_traction") == 0.0)
-            columns = [contact.points, contact.values.jump, unloaded]
-            rows = gather_rows(setup.comm, np.column_stack(columns))
-            setup.slip_resets[contact.name] = {
-                "rigid": rigid,
-                "u": _gather_displacement(setup),
-                "jump": rows[:, setup.d : 2 * setup.d],
-                "unloaded": rows[:, -1] > 0,
-            }
-            method(*given, **options)
+    def displaced(by: Any) -> Any:
+        positions[:] = [isinstance(by, ObstacleMotion)]
+        return displace(by)
 
-        return wrapped
+    def count_from_here(points: Array) -> None:
+        (rigid,) = positions
+        if rigid and not any(setup.comm.allgather(bool(points.any()))):
+            count(points)  # other bodies are positioned
+            return
+        unloaded = points & (contact.history.values("normal_traction") == 0.0)
+        columns = [contact.points, contact.values.jump, unloaded]
+        rows = gather_rows(setup.comm, np.column_stack(columns))
+        setup.slip_resets[contact.name] = {
+            "rigid": rigid,
+            "u": _gather_displacement(setup),
+            "jump": rows[:, setup.d : 2 * setup.d],
+            "unloaded": rows[:, -1] > 0,
+        }
+        count(points)
 
     def begin_between(opposite: Any) -> None:
         setup.paired_at[contact.name] = _gather_displacement(setup, opposite.pairs.found_at)
         begin(opposite)
 
     begin, contact.states.begin_between = contact.states.begin_between, begin_between  # type: ignore[method-assign]
-    contact.states.set_down = wrap(contact.states.set_down, rigid=True)  # type: ignore[method-assign]
-    contact.states.count_slip_from_here = wrap(  # type: ignore[method-assign]
-        contact.states.count_slip_from_here, rigid=False
-    )
+    displace = contact.opposite.displaced
+    contact.opposite.displaced = displaced  # type: ignore[method-assign]
+    count = contact.states.count_slip_from_here
+    contact.states.count_slip_from_here = count_from_here  # type: ignore[method-assign]
 
 
 def _make_record(

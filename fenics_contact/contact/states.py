@@ -140,30 +140,18 @@ class ContactStates:
             self.history.assign(kept | {"jump": kept["jump"] + moved})
         self.forget()
 
-    def set_down(self, moved: Mask) -> None:
-        """Measure slip from the state evaluated last at points that were unloaded. Collective.
-
-        It is called after the initial positioning of bodies. `restore` undoes it.
-
-        Args:
-            moved: Mask of the points that the positioning moved, (n_points,).
-        """
-        self._count_from_here(moved & (self.history.values("normal_traction") == 0.0))
-
     def count_slip_from_here(self, points: Mask) -> None:
-        """Measure slip at some points from the state evaluated last, where they touch. Collective.
+        """Measure slip from the state evaluated last where points were unloaded. Collective.
 
         `restore` undoes it.
 
         Args:
-            points: Mask of the points, (n_points,).
+            points: Mask of the points, (n_points,); those that were loaded slip from where they
+                did.
         """
-        self._count_from_here(points)
-
-    def _count_from_here(self, points: Mask) -> None:
-        """Measure slip at some points from the state evaluated last. Collective."""
         if not self._law.has_friction:
             return
+        points = points & (self.history.values("normal_traction") == 0.0)
         kept = {name: self.history.values(name) for name in self.history.names}
         feet = self._opposite.feet(self.values)
         counted = {n: np.where(points[:, None], v, kept[n]) for n, v in feet.items()}

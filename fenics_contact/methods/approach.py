@@ -145,7 +145,7 @@ class Approach:
                 if self._find_rest_position(load, which):
                     along = self._fit_obstacle_motion(which, motions)
                     for contact, jumps in zip(full.contacts, self._felt(of_bodies)[1], strict=True):
-                        contact.states.set_down(_feeling(jumps))
+                        contact.states.count_slip_from_here(_feeling(jumps))
             self._full.evaluate_at(aloft)
             if along is not None:
                 self._move(which, along)

@@ -9,13 +9,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from mpi4py import MPI
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_max, global_min
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.types import Array, Mask
 
-__all__ = ["FirstTouch"]
+__all__ = ["count_slip_from_touch"]
 
 # First touch is found where the least gap is below this share of the one at the start.
 _TOUCHING_GAP_RATIO = 1e-6
@@ -23,87 +24,49 @@ _TOUCHING_GAP_RATIO = 1e-6
 _MAX_EVALUATIONS = 20
 
 
-class FirstTouch:
-    """Finds where in an increment surfaces that begin it apart touch.
+def count_slip_from_touch(
+    full: FullSystem,
+    start: Array,
+    end_without: Callable[[Sequence[tuple[Contact, Mask]], Array], Array | None],
+) -> Array | None:
+    """Let slip at contacts that begin an increment apart be counted from first touch. Collective.
 
     Until then they exert no forces on each other, so that the bodies go where load, prescribed
     displacements and other contacts take them: for a linear bulk straight on.
 
-    Attributes:
-        end: The state that this leads to where nothing touches; None where something does, or no
-            contact is apart.
+    Args:
+        full: The system on all unknowns.
+        start: The state in which the increment starts, prescribed values as they were.
+        end_without: Finds the state in which it would end if contacts acted at some of their
+            points alone, from these and ``start``; None where nothing else holds the bodies.
+
+    Returns:
+        The state that this leads to where nothing touches; None where something does, or no
+        contact is apart.
     """
-
-    def __init__(self, full: FullSystem) -> None:
-        """Nothing is apart.
-
-        Args:
-            full: The system on all unknowns.
-        """
-        self._full = full
-        self.end: Array | None = None
-
-    def count_slip(
-        self,
-        start: Array,
-        end_without: Callable[[Sequence[tuple[Contact, Mask]], Array], Array | None],
-    ) -> None:
-        """Let slip at contacts that are apart be counted from first touch. Collective.
-
-        Args:
-            start: The state in which the increment starts, prescribed values as they were.
-            end_without: Finds the state in which it would end if contacts acted at some of their
-                points alone, from these and ``start``; None where nothing else holds the bodies.
-        """
-        full, self.end = self._full, None
-        parts = [part for part in self._parts() if self._is_idle(part)]
-        if not parts:
-            return
-        present = full.state()
-        full.evaluate_at(start)
-        ways = [part.contact.opposite.committed_offset(part.contact.values) for part in parts]
-        apart = [given for given in zip(parts, ways, strict=True) if self._is_apart(*given)]
-        full.set_state(present)
-        end = end_without(_without([part for part, _ in apart]), start) if apart else None
-        if end is not None:
-            paths = [_Path(full, *given, start, end) for given in apart]
-            shares = np.array([path.first_touch() for path in paths])
-            groups = np.array([path.part.group for path in paths])
-            for path, group in zip(paths, groups, strict=True):
-                share = shares[groups == group].min()
-                if share < 1.0:
-                    path.gap(share)
-                    path.part.contact.states.count_slip_from_here(path.part.points)
-            self.end = end if shares.min() == 1.0 else None
-        full.evaluate_at(present)
-
-    def _parts(self) -> list[_Part]:
-        """The contacts with friction, each divided by groups of coupled bodies. Collective."""
-        return [
-            _Part(contact, points, group)
-            for number, contact in enumerate(self._full.contacts)
-            if contact.law.has_friction
-            for group, points in self._full.scales.parts_of(number).items()
-        ]
-
-    def _is_idle(self, part: _Part) -> bool:
-        """Whether it bore nothing at the last commit. Collective."""
-        borne = np.abs(part.contact.history.values("normal_traction")[part.points])
-        return not global_max(self._full.unknowns.comm, borne) > 0.0
-
-    def _is_apart(self, part: _Part, way: Array) -> bool:
-        """Whether it neither acts nor touches, displaced by a way. Collective.
-
-        A facet along which the gap varies by more than its least at the points may touch between
-        them, as a ball does that stands on a node.
-        """
-        contact, comm = part.contact, self._full.unknowns.comm
-        rows = contact.quadrature.point_rows
-        gap = _gap(part, way)
-        acting = np.abs(contact.values.friction_bound) + np.abs(contact.values.normal_traction)
-        least, most = gap[rows].min(axis=1), np.where(gap < np.inf, gap, -np.inf)[rows].max(axis=1)
-        apart = global_min(comm, (2.0 * least - most)[least < np.inf], empty=0.0) > 0.0
-        return apart and not global_max(comm, acting[part.points]) > 0.0
+    comm = full.unknowns.comm
+    parts = [part for part in _parts(full) if part.is_idle(comm)]
+    if not parts:
+        return None
+    present = full.state()
+    full.evaluate_at(start)
+    ways = [part.contact.opposite.committed_offset(part.contact.values) for part in parts]
+    apart = [(part, way) for part, way in zip(parts, ways, strict=True) if part.is_apart(comm, way)]
+    full.set_state(present)
+    end = end_without(_without([part for part, _ in apart]), start) if apart else None
+    expected = None
+    if end is not None:
+        paths = [_Path(full, *given, start, end) for given in apart]
+        shares = np.array([path.first_touch() for path in paths])
+        groups = np.array([path.part.group for path in paths])
+        for path, group in zip(paths, groups, strict=True):
+            share = shares[groups == group].min()
+            if share < 1.0:
+                path.gap(share)
+                path.part.contact.states.count_slip_from_here(path.part.points)
+        expected = end if shares.min() == 1.0 else None
+    full.evaluate_at(present)
+    return expected
 
 
 @dataclass(frozen=True)
@@ -120,6 +83,44 @@ class _Part:
     points: Mask
     group: int
 
+    def is_idle(self, comm: MPI.Comm) -> bool:
+        """Whether it bore nothing at the last commit. Collective."""
+        borne = np.abs(self.contact.history.values("normal_traction")[self.points])
+        return not global_max(comm, borne) > 0.0
+
+    def is_apart(self, comm: MPI.Comm, way: Array) -> bool:
+        """Whether it neither acts nor touches, displaced by a way. Collective.
+
+        A facet along which the gap varies by more than its least at the points may touch between
+        them, as a ball does that stands on a node.
+        """
+        contact, gap = self.contact, self.gap(way)
+        rows = contact.quadrature.point_rows
+        acting = np.abs(contact.values.friction_bound) + np.abs(contact.values.normal_traction)
+        least, most = gap[rows].min(axis=1), np.where(gap < np.inf, gap, -np.inf)[rows].max(axis=1)
+        apart = global_min(comm, (2.0 * least - most)[least < np.inf], empty=0.0) > 0.0
+        return apart and not global_max(comm, acting[self.points]) > 0.0
+
+    def gap(self, way: Array) -> Array:
+        """Gaps of points displaced by a way, evaluated there, (n_points,) (length). Collective.
+
+        Those of points without an opposite, and of other parts, are infinite.
+        """
+        contact = self.contact
+        with contact.opposite.displaced(way):
+            contact.evaluate()
+        return np.where(contact.paired & self.points, contact.values.gap, np.inf)
+
+
+def _parts(full: FullSystem) -> list[_Part]:
+    """The contacts with friction, each divided by groups of coupled bodies. Collective."""
+    return [
+        _Part(contact, points, group)
+        for number, contact in enumerate(full.contacts)
+        if contact.law.has_friction
+        for group, points in full.scales.parts_of(number).items()
+    ]
+
 
 def _without(parts: Sequence[_Part]) -> list[tuple[Contact, Mask]]:
     """The contacts, and which of their points still act if the parts do not."""
@@ -130,45 +131,32 @@ def _without(parts: Sequence[_Part]) -> list[tuple[Contact, Mask]]:
     return list(acting.values())
 
 
-def _gap(part: _Part, way: Array) -> Array:
-    """Gaps of points displaced by a way, (n_points,) (length). Collective.
-
-    Those of points without an opposite, and of other parts, are infinite.
-    """
-    contact = part.contact
-    with contact.opposite.displaced(way):
-        contact.evaluate()
-    return np.where(contact.paired & part.points, contact.values.gap, np.inf)
-
-
+@dataclass(frozen=True)
 class _Path:
     """How the surfaces of a part approach each other as long as nothing touches.
 
     Attributes:
+        full: The system on all unknowns.
         part: The part.
+        way: Displacement of its obstacle in the increment, (n_points, gdim) (length).
+        start: The state in which the increment starts.
+        end: The state in which it would end.
     """
 
-    def __init__(self, full: FullSystem, part: _Part, way: Array, start: Array, end: Array) -> None:
-        """Take both ends.
-
-        Args:
-            full: The system on all unknowns.
-            part: The part.
-            way: Displacement of its obstacle in the increment, (n_points, gdim) (length).
-            start: The state in which the increment starts.
-            end: The state in which it would end.
-        """
-        self._full, self.part, self._way = full, part, way
-        self._start, self._end = start, end
+    full: FullSystem
+    part: _Part
+    way: Array
+    start: Array
+    end: Array
 
     def gap(self, share: float) -> Array:
         """Gaps at a share of the increment, evaluated there, (n_points,) (length). Collective."""
-        self._full.set_state(self._start + share * (self._end - self._start))
-        return _gap(self.part, (1.0 - share) * self._way)
+        self.full.set_state(self.start + share * (self.end - self.start))
+        return self.part.gap((1.0 - share) * self.way)
 
     def first_touch(self) -> float:
         """Share of the increment at which the least gap closes, 1 where none does. Collective."""
-        comm = self._full.unknowns.comm
+        comm = self.full.unknowns.comm
         low, high = 0.0, 1.0
         at_low, at_high = self.gap(low), self.gap(high)
         touching = _TOUCHING_GAP_RATIO * global_min(comm, at_low, empty=np.inf)
