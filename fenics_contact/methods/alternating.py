@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import logging
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from itertools import chain
 from typing import Any
 
@@ -23,9 +23,8 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
-from fenics_contact.methods.callbacks import Callbacks
 from fenics_contact.methods.limit_analysis import CLEARLY
-from fenics_contact.methods.method import OVERLOADED, OwnMethod, Tools
+from fenics_contact.methods.method import OVERLOADED, OwnMethod, SnesMethod, Tools
 from fenics_contact.types import Array
 
 __all__ = ["Alternation"]
@@ -64,6 +63,8 @@ _INNER = 1e-2
 # Share of k_t that keeps a slipping body in place in the matrix (not in the equations).
 _STILL = 1e-6
 
+_REASONS = PETSc.SNES.ConvergedReason
+
 
 class Alternation(OwnMethod):
     """The method.
@@ -75,33 +76,17 @@ class Alternation(OwnMethod):
     def __init__(self, tools: Tools) -> None:
         """Set up SNES; the matrices are those of H₀. Collective."""
         self._equations = tools.equations
-        self._search = _InnerSnes(tools, "alternating_", _OPTIONS)
-        self._finish = _InnerSnes(tools, "finishing_", _FINISH)
+        self._search = _Search(tools, "alternating_", _OPTIONS)
+        self._finish = _Minimisation(tools, "finishing_", _FINISH)
         self.snes = self._search.snes
-        self._goal = 0.0
-        # Potential at the state asked for last, and where it was last found to have fallen.
-        self._energy = self._reached = np.inf
-
-    def _attach(self) -> None:
-        """Let both take the present system."""
-        this: Alternation = weakref.proxy(self)
-
-        def assemble(x: PETSc.Vec, matrix: PETSc.Mat) -> None:
-            this._assemble(x, matrix)
-
-        def energy(x: PETSc.Vec) -> float:
-            return this._compute_energy(x)
-
-        linear = self._equations.full.bulk.linear
-        self._search.attach(assemble, lambda: this._falls(), energy if linear else None)
-        self._finish.attach(assemble, lambda: this._test())
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`. Iterations are Newton's, in all."""
-        equations, reasons = self._equations, PETSc.SNES.ConvergedReason
+        equations = self._equations
         if not self.suits:
-            return 0, int(reasons.DIVERGED_LINE_SEARCH)
-        self._attach()
+            return 0, int(_REASONS.DIVERGED_LINE_SEARCH)
+        for method in (self._search, self._finish):
+            method.attach(consistent=False)
         iterations = stalls = overloads = 0
         best = np.inf
         relaxation = 1.0
@@ -122,22 +107,22 @@ class Alternation(OwnMethod):
                 for contact, part in zip(equations.contacts, np.split(bound, ends), strict=True):
                     contact.acting.fix_friction_bound(part)
                 share = 0.0 if equations.has_potential else _INNER
-                self._goal = share * residual
+                self._search.goal = self._finish.goal = share * residual
                 iterations += self._minimise()
                 residual = self._residual()
                 if equations.solved():
                     logger.debug("%d cycles, %d Newton iterations", cycle + 1, iterations)
-                    return iterations, int(reasons.CONVERGED_FNORM_RELATIVE)
+                    return iterations, int(_REASONS.CONVERGED_FNORM_RELATIVE)
                 stalls = 0 if residual < best else stalls + 1
                 best = min(best, residual)
                 if not np.isfinite(residual) or stalls > _MAX_STALLS or equations.has_potential:
-                    return iterations, int(reasons.DIVERGED_LINE_SEARCH)
+                    return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
                 if iterations > _MAX_ITERATIONS:
-                    return iterations, int(reasons.DIVERGED_MAX_IT)
+                    return iterations, int(_REASONS.DIVERGED_MAX_IT)
                 if stalls and stalls % _PATIENCE == 0:
                     relaxation = max(relaxation / 2, _LEAST)
                 bound = bound + relaxation * (self._friction_bound() - bound)
-            return iterations, int(reasons.DIVERGED_MAX_IT)
+            return iterations, int(_REASONS.DIVERGED_MAX_IT)
         finally:
             equations.forget_h0()
             for contact in equations.contacts:
@@ -185,105 +170,92 @@ class Alternation(OwnMethod):
 
     def _minimise(self) -> int:
         """Newton's method with the line search on the energy, then without any."""
-        self._energy = self._reached = np.inf
         made, reason = self._search.solve()
         if reason <= 0:
             # The last digits of the residual are below the rounding of the energy.
             made += self._finish.solve()[0]
         return made
 
-    def _test(self) -> int:
-        reasons, equations = PETSc.SNES.ConvergedReason, self._equations
-        converged = equations.norms.total <= self._goal or equations.solved()
-        return int(reasons.CONVERGED_FNORM_RELATIVE if converged else reasons.ITERATING)
 
-    def _compute_energy(self, x: PETSc.Vec) -> float:
-        self._energy = self._equations.energy(x)
-        return self._energy
-
-    def _falls(self) -> int:
-        """`_test`, and an end where the energy has no digits left to tell a descent. Collective."""
-        reason, ongoing = self._test(), int(PETSc.SNES.ConvergedReason.ITERATING)
-        if reason == ongoing and self._equations.solved(_NEAR):
-            return int(PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH)
-        if reason != ongoing or not np.isfinite(self._energy):
-            return reason
-        fallen = self._reached - self._energy
-        self._reached = self._energy
-        if fallen <= _NOISE * self._equations.energy_size():
-            return int(PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH)
-        return ongoing
-
-    def _assemble(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
-        equations = self._equations
-        equations.evaluate(x)
-        if not equations.is_constrained():
-            equations.assemble(matrix, equations.stiffnesses(everywhere=True))
-            return
-        # Where all slips, what nothing but friction holds would be loose.
-        still = (
-            o.springs(o.contact.values.springs(0.0, _STILL)) for o in equations.system.operators
-        )
-        equations.assemble(matrix, chain(equations.tangents(), still))
-
-
-class _InnerSnes:
-    """A SNES for the problems that are solved one after another, whose matrices are those of H₀.
+class _Minimisation(SnesMethod):
+    """Newton's method for the problems that are solved one after another, with the matrix of H₀.
 
     Attributes:
-        snes: The solver.
+        goal: Residual to which the present one is solved (force).
     """
 
     def __init__(self, tools: Tools, part: str, options: Mapping[str, Any]) -> None:
-        """Make it. Collective.
+        """Make its SNES. Collective.
 
         Args:
             tools: What it is made of.
             part: What follows the prefix of the problem's options in that of this one.
             options: Those of SNES.
         """
-        self._equations = equations = tools.equations
-        comm = equations.full.unknowns.comm
-        solver = tools.linear_solver(equations.symmetric(False))
-        self._shares_solver = not solver  # that of the matrix will do
-        self._function: PETSc.Vec | None = None
-        self.snes = tools.defaults.make_snes(comm, tools.prefix, part, {**options, **solver})
-        self._callbacks = Callbacks(comm)
-
-    def attach(
-        self,
-        assemble: Callable[[PETSc.Vec, PETSc.Mat], None],
-        converged: Callable[[], int],
-        energy: Callable[[PETSc.Vec], float] | None = None,
-    ) -> None:
-        """Take vectors, matrix and solver of the present system. Collective.
-
-        Args:
-            assemble: Fills the matrix at x. It must not keep this object, which keeps it.
-            converged: Whether to end, and why; likewise.
-            energy: What the line search is to lower; none: it looks at the residual.
-        """
-        equations = self._equations
-        if self._function is not equations.function:
-            self.snes.reset()
-        self._function = equations.function
-        if self._shares_solver:
-            self.snes.setKSP(equations.solvers[False])
-        this: _InnerSnes = weakref.proxy(self)
-        self._callbacks.attach(
-            self.snes,
-            lambda x, f: this._compute_residual(x, f),
-            self._function,
-            assemble,
-            equations.matrix(False),
-            converged,
-        )
-        if energy is not None:
-            self._callbacks.set_objective(self.snes, energy)
+        snes, own = tools.snes(part, options, consistent=False)
+        super().__init__(tools.equations, snes, lambda: False, own_solver=own)
+        self.goal = 0.0
 
     def solve(self) -> tuple[int, int]:
-        """Iterations and reason, from ``solution`` of the equations on. Collective."""
+        """See `Method.solve`."""
         return self._callbacks.solve(self.snes, self._equations.solution)
 
-    def _compute_residual(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        self._equations.residual(x, f)
+    def converged(self) -> int:
+        """See `SnesMethod.converged`."""
+        equations = self._equations
+        converged = equations.norms.total <= self.goal or equations.solved()
+        return int(_REASONS.CONVERGED_FNORM_RELATIVE if converged else _REASONS.ITERATING)
+
+    def _compute_jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
+        equations = self._equations
+        equations.evaluate(x)
+        if not equations.is_constrained():
+            equations.assemble(J, equations.stiffnesses(everywhere=True))
+            return
+        # Where all slips, what nothing but friction holds would be loose.
+        still = (
+            o.springs(o.contact.values.springs(0.0, _STILL)) for o in equations.system.operators
+        )
+        equations.assemble(J, chain(equations.tangents(), still))
+
+
+class _Search(_Minimisation):
+    """The same with a line search on the energy, where the bulk has one."""
+
+    def __init__(self, tools: Tools, part: str, options: Mapping[str, Any]) -> None:
+        """See `_Minimisation`."""
+        super().__init__(tools, part, options)
+        # Potential at the state asked for last, and where it was last found to have fallen.
+        self._energy = self._reached = np.inf
+
+    def attach(self, *, consistent: bool) -> None:
+        """See `SnesMethod.attach`."""
+        super().attach(consistent=consistent)
+        this: _Search = weakref.proxy(self)
+        if self._equations.full.bulk.linear:
+            self._callbacks.set_objective(self.snes, lambda x: this._compute_energy(x))
+
+    def solve(self) -> tuple[int, int]:
+        """See `Method.solve`."""
+        self._energy = self._reached = np.inf
+        return super().solve()
+
+    def _compute_energy(self, x: PETSc.Vec) -> float:
+        self._energy = self._equations.energy(x)
+        return self._energy
+
+    def converged(self) -> int:
+        """See `SnesMethod.converged`; an end, too, where the energy has no digits left. Collective.
+
+        Differences of these tell no descent.
+        """
+        reason, ongoing = super().converged(), int(_REASONS.ITERATING)
+        if reason == ongoing and self._equations.solved(_NEAR):
+            return int(_REASONS.DIVERGED_LINE_SEARCH)
+        if reason != ongoing or not np.isfinite(self._energy):
+            return reason
+        fallen = self._reached - self._energy
+        self._reached = self._energy
+        if fallen <= _NOISE * self._equations.energy_size():
+            return int(_REASONS.DIVERGED_LINE_SEARCH)
+        return ongoing

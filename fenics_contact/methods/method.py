@@ -76,12 +76,29 @@ class Tools:
             part: What follows the prefix of the problem's options in that of this SNES.
             options: Those that differ from `Newton.main_options`.
         """
-        equations = self.equations
-        solver = self.linear_solver(equations.symmetric(True))
-        comm = equations.full.unknowns.comm
-        all_options = {**Newton.main_options(), **options, **solver}
-        snes = self.defaults.make_snes(comm, self.prefix, part, all_options)
-        return Newton(equations, snes, lambda: True, own_solver=bool(solver))
+        snes, own = self.snes(part, {**Newton.main_options(), **options})
+        return Newton(self.equations, snes, lambda: True, own_solver=own)
+
+    def snes(
+        self,
+        part: str,
+        options: Mapping[str, Any],
+        *,
+        consistent: bool = True,
+        with_own: Mapping[str, Any] | None = None,
+    ) -> tuple[PETSc.SNES, bool]:
+        """A SNES of its own, and whether its linear solver is, too. Collective.
+
+        Args:
+            part: What follows the prefix of the problem's options in that of this SNES.
+            options: Of it, that of a linear solver of its own apart.
+            consistent: Whether it is for the consistent tangent, not for H₀.
+            with_own: More of them where the linear solver is its own.
+        """
+        solver = self.linear_solver(self.equations.symmetric(consistent))
+        every = {**options, **solver, **((with_own or {}) if solver else {})}
+        comm = self.equations.full.unknowns.comm
+        return self.defaults.make_snes(comm, self.prefix, part, every), bool(solver)
 
 
 class OwnMethod(Method):

@@ -70,11 +70,8 @@ class PrimalDual(OwnMethod):
     def __init__(self, tools: Tools) -> None:
         """Set up SNES; the matrix is that of the consistent tangent. Collective."""
         equations = self._equations = tools.equations
-        solver = tools.linear_solver(equations.symmetric(True))
-        options = {**_OPTIONS, **solver, **(_ITERATED if solver else {})}
-        comm = equations.full.unknowns.comm
-        self.snes = tools.defaults.make_snes(comm, tools.prefix, "primal_dual_", options)
-        self._newton = _MixedNewton(equations, self.snes, own_solver=bool(solver))
+        self.snes, own = tools.snes("primal_dual_", _OPTIONS, with_own=_ITERATED)
+        self._newton = _MixedNewton(equations, self.snes, own_solver=own)
 
     def check(self) -> None:
         """See `OwnMethod.check`: friction by springs, of a linear bulk."""
