@@ -97,7 +97,6 @@ class IncrementSolver:
         self._balance, self._prefix = balance, prefix
         self._bulk, self._contacts, self._comm = full.bulk, full.contacts, full.unknowns.comm
         self._u = full.displacement.whole
-        self._approach = Approach(full, solver.equations.motions)
 
     # ---- what is given ---------------------------------------------------------------------------
 
@@ -155,7 +154,8 @@ class IncrementSolver:
         stiffness_changed = self._full.update_stiffness()
         if stiffness_changed and self._bulk.linear:
             self.modulus.measure()
-        cold = self._approach.lead(load, before, first=state.increment == 0)
+        approach = Approach(self._full, solver.equations.motions, load, before)
+        cold = approach.lead(first=state.increment == 0)
         if solver.chooses():
             return Again.UNKNOWNS
         solver.update_system(stiffness_changed)

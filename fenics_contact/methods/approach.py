@@ -58,26 +58,29 @@ def _feeling(jumps: Array) -> Mask:
 
 
 class Approach:
-    """Where bodies without contact come from and go to."""
+    """Where bodies without contact come from and go to in an increment."""
 
-    def __init__(self, full: FullSystem, motions: RigidBodyModes) -> None:
+    def __init__(
+        self, full: FullSystem, motions: RigidBodyModes, load: Array, before: Array
+    ) -> None:
         """Nothing has moved yet.
 
         Args:
             full: The system on all unknowns.
             motions: Rigid motions of the bodies.
+            load: External forces at this rank's unknowns (force).
+            before: The state before Dirichlet conditions took their present values.
         """
         self._full, self._motions = full, motions
+        self._load, self._before = load, before
 
-    def lead(self, load: Array, before: Array, *, first: bool) -> bool:
+    def lead(self, *, first: bool) -> bool:
         """Set bodies that nothing holds yet down, or move them to first touch. Collective.
 
         One that was released before is set down from where it was left, for that may be far along
         its obstacle.
 
         Args:
-            load: External forces at this rank's unknowns (force).
-            before: The state before Dirichlet conditions took their present values.
             first: Whether it is the first increment.
 
         Returns:
@@ -88,14 +91,14 @@ class Approach:
             return first
         full.evaluate()
         finite = all(contact.finite for contact in full.contacts)
-        groups, load_size = motions.groups(), motions.generalised_load(load)
+        groups, load_size = motions.groups(), motions.generalised_load(self._load)
         borne = full.contact_force_sizes(committed=finite)
         idle = (borne < _IDLE * load_size)[groups] & (not first)
         untouched = self._untouched()
         if first:
             here = full.state()
-            with self._obstacles_at_start(before):
-                self._full.evaluate_at(before)
+            with self._obstacles_at_start():
+                self._full.evaluate_at(self._before)
                 untouched = np.union1d(untouched, self._untouched())
             self._full.evaluate_at(here)
         if len(untouched) < len(motions.free) and motions.turning:
@@ -105,7 +108,7 @@ class Approach:
         # Groups of coupled bodies come to rest apart, and those without load stay.
         for group in np.unique(groups[which]):
             if load_size[group] > 0:
-                self._set_down(load, before, which[groups[which] == group])
+                self._set_down(which[groups[which] == group])
         return first or bool(idle.any())
 
     def _untouched(self) -> Index:
@@ -121,7 +124,7 @@ class Approach:
         # What turns about a point does not move there.
         return np.flatnonzero(~(motions.of_same_body() @ (touched > 0)))
 
-    def _set_down(self, load: Array, before: Array, which: Index) -> None:
+    def _set_down(self, which: Index) -> None:
         """Move bodies that touch nothing to where they rest, or to first touch. Collective.
 
         Slip is counted from where they rest as the increment begins: before prescribed
@@ -129,8 +132,6 @@ class Approach:
         which they rest then, and to where they rest at the end of the increment.
 
         Args:
-            load: As in `lead`.
-            before: As in `lead`.
             which: Numbers of their free motions.
         """
         full = self._full
@@ -140,17 +141,18 @@ class Approach:
         of_bodies = which[self._motions.of_any_body()[which]]
         if len(of_bodies) and any(contact.law.has_friction for contact in full.contacts):
             along = None
-            with self._obstacles_at_start(before) as motions:
-                self._full.evaluate_at(np.where(full.constrained, before, aloft))
-                if self._find_rest_position(load, which):
+            with self._obstacles_at_start() as motions:
+                self._full.evaluate_at(np.where(full.constrained, self._before, aloft))
+                if self._find_rest_position(which):
                     along = self._fit_obstacle_motion(which, motions)
                     for contact, jumps in zip(full.contacts, self._felt(of_bodies)[1], strict=True):
                         contact.states.count_slip_from_here(_feeling(jumps))
             self._full.evaluate_at(aloft)
             if along is not None:
                 self._move(which, along)
-        self._find_rest_position(load, which)
-        self._follow_stiffness()
+        self._find_rest_position(which)
+        if not full.bulk.linear:
+            full.update_stiffness()  # of a bulk that has turned
 
     def _fit_obstacle_motion(self, which: Index, obstacles: Sequence[ObstacleMotion]) -> Array:
         """Fit free motions to the motion of the obstacles that bodies touch. Collective.
@@ -180,16 +182,13 @@ class Approach:
         return agreed(comm, np.linalg.lstsq(gram, work, rcond=_SHARED)[0])
 
     @contextlib.contextmanager
-    def _obstacles_at_start(self, before: Array) -> Iterator[list[ObstacleMotion]]:
+    def _obstacles_at_start(self) -> Iterator[list[ObstacleMotion]]:
         """Evaluate contacts with rigid obstacles where they were at the last commit. Collective.
-
-        Args:
-            before: As in `lead`.
 
         Yields:
             Motion in the increment of the obstacle of every contact.
         """
-        self._full.evaluate_at(before)
+        self._full.evaluate_at(self._before)
         contacts = self._full.contacts
         motions = [contact.opposite.motion_in_increment(contact.values) for contact in contacts]
         with contextlib.ExitStack() as back:
@@ -197,11 +196,10 @@ class Approach:
                 back.enter_context(contact.opposite.displaced(motion))
             yield motions
 
-    def _find_rest_position(self, load: Array, which: Index) -> bool:
+    def _find_rest_position(self, which: Index) -> bool:
         """Move bodies from here to where they rest, or to first touch. Collective.
 
         Args:
-            load: As in `lead`.
             which: Numbers of their free motions.
 
         Returns:
@@ -209,19 +207,14 @@ class Approach:
         """
         here = self._full.state()
         for along in (_ALONG, np.inf):
-            if self._lands(load, which, along):
+            if self._lands(which, along):
                 return True
             self._full.evaluate_at(here)
-        free = self._free(load, which)
+        free = self._free(which)
         way = None if free is None else self._to_first_touch(free)
         if way is not None:
             self._move(which, way)
         return way is not None
-
-    def _follow_stiffness(self) -> None:
-        """Take that of a nonlinear bulk which has turned. Collective."""
-        if not self._full.bulk.linear:
-            self._full.update_stiffness()
 
     def _felt(self, which: Index) -> tuple[Array, list[Array]]:
         """The free motions of these numbers at this rank's unknowns, and at points. Collective.
@@ -232,11 +225,11 @@ class Approach:
         fields, at_points = self._motions.present(self._full.operators)
         return fields[which], [jumps[which] for jumps in at_points]
 
-    def _free(self, load: Array, which: Index) -> _Free | None:
+    def _free(self, which: Index) -> _Free | None:
         """The free motions of these numbers; None: the load drives none. Collective."""
         comm = self._full.unknowns.comm
         fields, jumps = self._felt(which)
-        drive = global_sum(comm, fields @ load)
+        drive = global_sum(comm, fields @ self._load)
         most = np.abs(drive).max()
         mass = global_sum(comm, fields @ fields.T)
         opposites = [contact.opposite for contact in self._full.contacts]
@@ -268,18 +261,17 @@ class Approach:
 
     # ---- to where a body rests -------------------------------------------------------------------
 
-    def _lands(self, load: Array, which: Index, along: float) -> bool:
+    def _lands(self, which: Index, along: float) -> bool:
         """Move rigid bodies to where they come to rest, if they do. Collective.
 
         One set down on an edge has to be turned: the load does not lead there.
 
         Args:
-            load: As in `lead`.
             which: Numbers of their free motions.
             along: The largest share of a motion that may go along a Γc that grips.
         """
         full, comm = self._full, self._full.unknowns.comm
-        free = self._free(load, which)
+        free = self._free(which)
         if free is None:
             return False
         gaps = [
@@ -292,7 +284,7 @@ class Approach:
         linear = full.bulk.linear and not any(contact.finite for contact in full.contacts)
         turn = np.inf if linear else _TURN
         for _ in range(_STEPS):
-            free = self._free(load, which)
+            free = self._free(which)
             landed = None if free is None else self._landed(free, far, turn, along)
             if landed is None or free is None:
                 return False
