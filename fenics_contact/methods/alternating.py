@@ -124,7 +124,7 @@ class Alternation(OwnMethod):
                 bound = bound + relaxation * (self._friction_bound() - bound)
             return iterations, int(_REASONS.DIVERGED_MAX_IT)
         finally:
-            equations.forget_h0()
+            equations.h0_is_made = False
             for contact in equations.contacts:
                 contact.acting.release_friction_bound()
 

@@ -92,7 +92,7 @@ class Continuation(OwnMethod):
             return iterations, int(PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT)
         finally:
             self._soften(1.0)
-            equations.forget_h0()
+            equations.h0_is_made = False
 
     def _soften(self, share: float) -> None:
         """Let the contacts have a share of the stiffness they came with."""

@@ -7,7 +7,6 @@ that the same scene takes the same iterations in any units.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Any
 
 import numpy as np
 from petsc4py import PETSc
@@ -56,6 +55,9 @@ class Equations:
         solution: The state to start from and, after a method, the one found; dimensionless.
         function: For the residual.
         solvers: Linear solvers for H₀ (False) and the consistent tangent (True).
+        filled: Which of their matrices hold anything, and not that of another state.
+        h0_is_made: Whether that of H₀ is what `make_h0` made, or made of the status since; False
+            lets it be made before its next use.
         by_cycle: Whether H₀ is a V-cycle, which serves for its matrix as for the tangent.
         hierarchy: Its levels.
         factorisations: Of sparse matrices, counted.
@@ -92,9 +94,8 @@ class Equations:
         self.regularised_modes: Array = np.zeros((0, 0))
         self.overload: Overload | None = None
         self._matrices: dict[bool, PETSc.Mat] = {}
-        self._filled: set[bool] = set()
-        self._h0_is_made = False
-        self._hardness: tuple[Any, float] | None = None  # of what, and how much
+        self.filled: set[bool] = set()
+        self.h0_is_made = False
         self.system: System = full
         self.began = full.state()
         self.has_round_off = False
@@ -197,32 +198,15 @@ class Equations:
 
     def forget_matrices(self) -> None:
         """Drop the matrices of H₀ and of the consistent tangent. Collective."""
-        self._matrices, self._filled, self.hierarchy = {}, set(), Hierarchy()
+        self._matrices, self.filled, self.hierarchy = {}, set(), Hierarchy()
         for ksp in self.solvers.values():
             ksp.reset()
-        self.forget_h0()
-
-    def filled(self, consistent: bool) -> bool:
-        """Whether H₀ or the consistent tangent holds anything."""
-        return consistent in self._filled
-
-    def forget_tangent(self) -> None:
-        """Let the matrix of the consistent tangent hold nothing: it was that of another state."""
-        self._filled.discard(True)
-
-    @property
-    def h0_is_made(self) -> bool:
-        """Whether the matrix of H₀ is that of `make_h0`, or of the status since."""
-        return self._h0_is_made
+        self.h0_is_made = False
 
     def make_h0(self, *, everywhere: bool) -> None:
         """K + αK_n + φK_t of a symmetric H₀ (section 5); see `stiffnesses`. Collective."""
         self.assemble(self.matrix(False), self.stiffnesses(everywhere=everywhere))
-        self._h0_is_made = True
-
-    def forget_h0(self) -> None:
-        """Let H₀ be made before its next use: stiffness, or what is in its matrix, is another."""
-        self._h0_is_made = False
+        self.h0_is_made = True
 
     def assemble(self, matrix: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> None:
         """Bulk tangent plus contact, conditions applied, dimensionless. Collective.
@@ -243,32 +227,30 @@ class Equations:
             for consistent in filled:
                 self.solvers[consistent].reset()
                 self.solvers[consistent].setOperators(matrix)
-        self._filled |= filled
+        self.filled |= filled
         if self.by_cycle and False in filled:
             stiffness, operators = self.full.stiffness, self.full.operators
             assert stiffness is not None
             self.hierarchy.follow(self.solvers[False], matrix, stiffness, operators)
 
-    def assemble_tangent(self, x: PETSc.Vec, matrix: PETSc.Mat) -> None:
-        """The consistent tangent of bulk and contact at ``x``. Collective."""
-        self.evaluate(x)
+    def assemble_tangent(self, x: PETSc.Vec, matrix: PETSc.Mat, *, trial: bool = False) -> None:
+        """The consistent tangent of bulk and contact at ``x``; see `evaluate`. Collective."""
+        self.evaluate(x, trial=trial)
         self.assemble(matrix, self.regularised_tangents())
 
-    def assemble_trial_tangent(self, x: PETSc.Vec) -> None:
-        """That into `matrix`, at a trial ``x`` that is no iterate: `watch` does not see it."""
-        self._evaluate(x)
-        self.assemble(self.matrix(True), self.regularised_tangents())
+    def evaluate(self, x: PETSc.Vec, *, trial: bool = False) -> None:
+        """Evaluate bulk and contacts at ``x``, where the residual was computed last. Collective.
 
-    def evaluate(self, x: PETSc.Vec) -> None:
-        """Evaluate bulk and contacts at ``x``, where the residual was computed last. Collective."""
-        self._evaluate(x)
-        self.note()
-
-    def _evaluate(self, x: PETSc.Vec) -> None:
+        Args:
+            x: Where.
+            trial: Whether that is no iterate: then `watch` does not see it.
+        """
         self.set_state(x)
         if not self._bulk.linear:  # else nothing changes it during a solution
             self.full.update_stiffness()
         self.full.evaluate()
+        if not trial:
+            self.note()
 
     def note(self) -> None:
         """Let `watch` see the status of the points, evaluated where `norms` are from."""
@@ -345,16 +327,10 @@ class Equations:
 
     def hardness(self) -> float:
         """Largest ratio of contact's stiffness to the bulk's at an unknown. Collective."""
-        springs = [c.values.springs(1.0, 1.0) for c in self.contacts]
-        stiffest = [global_max(self._comm, s) for s in springs]
-        pairings = [c.pairs.number for c in self.contacts]
-        given = self.system.mark, self._bulk.scale, pairings, stiffest
-        if self._bulk.linear and self._hardness and self._hardness[0] == given:
-            return self._hardness[1]
         bulk = self.system.bulk_diagonal()
         added = np.zeros_like(bulk)
-        for operator, stiffness in zip(self.system.operators, springs, strict=True):
-            part = operator.springs(stiffness)
+        for operator in self.system.operators:
+            part = operator.springs(operator.contact.values.springs(1.0, 1.0))
             diagonal = part.getDiagonal()
             added += diagonal.array_r
             part.destroy()
@@ -362,6 +338,4 @@ class Equations:
         # The motion of an obstacle has no stiffness.
         stiffness = np.append(self.full.scales.stiffness, np.full(self.system.n_bodies, np.inf))
         felt = (bulk > ROUND_OFF * stiffness[self.system.label]) & ~self.system.constrained
-        found = global_max(self._comm, added[felt] / bulk[felt])
-        self._hardness = given, found
-        return found
+        return global_max(self._comm, added[felt] / bulk[felt])

@@ -311,12 +311,13 @@ class Newton(SnesMethod):
         enough = 1.0 - _DECREASE * min(1.0, float(share))
         level = min(fall, self._correction(f) / self._step) / enough
         if level > 1.0 and share > _WHOLE and self._looks_ahead:
-            self._equations.assemble_trial_tangent(x)
+            tangent = self._equations.matrix(True)
+            self._equations.assemble_tangent(x, tangent, trial=True)
             if self._correction(f) <= enough * self._step:
                 self._trial = x.array_r.copy()
                 return 0.0
             self._looks_ahead, self._trial = False, None
-            self._equations.assemble_trial_tangent(iterate)
+            self._equations.assemble_tangent(iterate, tangent, trial=True)
         return float(level * level)  # infinite where it overflows
 
     def _correction(self, f: PETSc.Vec) -> float:

@@ -112,7 +112,7 @@ def respond(
     matrix = system.matrix(symmetric=False)
     ksp = PETSc.KSP().create(right.comm)
     try:
-        if not equations.filled(consistent):  # nothing was iterated yet
+        if consistent not in equations.filled:  # nothing was iterated yet
             equations.assemble(equations.matrix(consistent), equations.tangents())
         parts = (o.springs(k) for o, k in zip(system.operators, springs, strict=True))
         system.fill(matrix, parts)

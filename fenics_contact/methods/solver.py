@@ -482,7 +482,7 @@ class Solver:
             equations.solution.array[:] = start
             equations.watch.start()
             if stiffness_changed:
-                equations.forget_h0()
+                equations.h0_is_made = False
             iterations, reason = self.methods.get(method, self.main).solve()
             attempts.append(Attempt(method, iterations, self._outcome(reason)))
             if reason > 0:
@@ -601,7 +601,7 @@ class Solver:
                 with linearised(self.equations, springs, prescribed=moved) as solve:
                     return present + solve(None)
             finally:
-                self.equations.forget_tangent()
+                self.equations.filled.discard(True)  # it is that of another state
                 for contact, _ in acting:
                     contact.confine()
                 full.set_state(present)
@@ -611,5 +611,5 @@ class Solver:
     def respond(self, springs: Sequence[Array], tractions: Sequence[Array]) -> list[Array]:
         """`neighbourhood.respond`, by the matrix factored last. Collective."""
         made = self.equations.filled
-        consistent = self.main.consistent or made(True) or not made(False)
+        consistent = self.main.consistent or True in made or False not in made
         return respond(self.equations, springs, tractions, consistent=consistent)
