@@ -404,6 +404,8 @@ class Contact(PointResults):
     @cached_property
     def traces(self) -> TraceProjection:
         """The L² projection onto the multiplier space on Γc. Collective."""
+        if self.multipliers is not None:
+            return self.multipliers.project
         return TraceProjection(self.quadrature, self.displacement.degree)
 
     @cached_property

@@ -95,6 +95,7 @@ class Multipliers:
     Attributes:
         fields: "pressure" λ_n and, with friction, "traction" λ_t (stress), in the frame of the
             obstacle; where normals turn, "normal" are those it is across.
+        project: The L² projection onto the space that they are in.
         as_displacement: Whether they are functions of the displacement's own degree, which is 1.
     """
 
@@ -116,7 +117,7 @@ class Multipliers:
         gdim = quadrature.surface.mesh.geometry.dim
         self.fields = PointFields(quadrature, {"pressure": 0} | dict.fromkeys(self._vectors, gdim))
         self.as_displacement = degree == 1
-        self._project = TraceProjection(quadrature, degree)
+        self.project = TraceProjection(quadrature, degree)
         # By connected part of Γc: one of them may bear a millionth of another.
         self._patch, self._n_patches = _patches(quadrature)
         # Of every part, change and tractions of the first round; NaN: there was none yet.
@@ -127,9 +128,9 @@ class Multipliers:
         """The multipliers that the tractions of an evaluated contact make."""
         found: dict[str, Array] = {"pressure": np.zeros(len(values.normal_traction))}
         if self._law.has_normal_stiffness:
-            found["pressure"] = self._project(-values.normal_traction)
+            found["pressure"] = self.project(-values.normal_traction)
         if self._law.has_friction:
-            found["traction"] = self._project(values.framed_traction)
+            found["traction"] = self.project(values.framed_traction)
             if self._left_out is not None:
                 found["traction"] -= self._left_out
         return found
