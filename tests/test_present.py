@@ -21,7 +21,7 @@ from fenics_contact.elasticity import NeoHookean
 from fenics_contact.systems.operator import ContactOperator
 from scenes.elasticity import displacement_space, hold, residual
 from scenes.meshes import mesh_of
-from scenes.stacks import FLOOR, ROOF, SIDES, joint, stack
+from scenes.stacks import FLOOR, ROOF, SIDES, floor, joint, stack
 from scenes.tags import near, tagged
 from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, two_blocks
 from verification.extreme_bodies import Two
@@ -631,3 +631,32 @@ def test_condensation_needs_bodies_that_are_held(held):
     if not held:
         with pytest.raises(ValueError, match="constrained by contact only"):
             fc.ContactProblem(*given[0], **given[1], condensation=True)
+
+
+def test_points_that_all_slip_while_friction_holds() -> None:
+    """Three loose blocks, each wider than the one below, on a floor that tilts to 0.95 of μ.
+
+    Where the surfaces stretch apart all points of a joint may slip, some this way and some that,
+    while their friction still holds what lies on it. The slopes of the strained surfaces, 1e-4, are
+    all that the tangent has along the slip then: a step by it goes 1e4 times too far. By statics
+    tangential and normal forces of every joint are as sine and cosine of the angle.
+    """
+    body = stack("quadrilateral", (4, 6, 4), (0.2, 0.2, 0.2), widths=(0.7, 1.0, 1.4), nu=0.2)
+    weight = body.constant(np.zeros(2))
+    body.F -= ufl.dot(weight, body.v) * ufl.dx
+    law, finite = fc.Coulomb(0.3), {"kinematics": "finite"}
+    contacts = [
+        floor(body, law, **finite),
+        joint(body, 1, law, **finite),
+        joint(body, 2, law, swap=True, **finite),
+    ]
+    problem = body.problem(*contacts)
+    for share in np.linspace(0.0, 0.95, 7):
+        angle = np.arctan(0.3 * share)
+        weight.value[:] = 1e3 * np.sin(angle), -1e3 * np.cos(angle)
+        step = problem.solve()
+        problem.commit()
+        assert [attempt.method for attempt in step.attempts] == ["newton"]
+        for contact in contacts:
+            force = contact.resultants().force
+            assert abs(force[0]) == pytest.approx(0.3 * share * abs(force[1]), rel=1e-6, abs=1e-6)

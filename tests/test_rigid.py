@@ -7,6 +7,7 @@ import fenics_contact as fc
 from fenics_contact.methods.load_balance import unbalanced
 from scenes.blocks import block
 from scenes.comparing import raised_everywhere
+from scenes.stacks import ROOF, floor, stack
 
 pytestmark = pytest.mark.two_ranks
 
@@ -59,3 +60,21 @@ def test_a_block_beside_its_friction_angle(n, above):
         problem.solve()
     else:
         raised_everywhere(problem.solve, ValueError, "balance")
+
+
+@pytest.mark.parametrize("n", [1, 2, 4])
+def test_a_block_tips_over_its_outermost_points(n):
+    """A block of height 2 on n facets of a floor, pushed at its top: over two Gauss points a facet.
+
+    By statics it tips where the resultant leaves the points, 0.2113 of a facet from its edges.
+    """
+    body = stack("quadrilateral", (n,), (2.0,))
+    push, weight = body.constant(0.0), 1e3
+    body.F += (weight * body.v[1] - push * body.v[0]) * body.ds(ROOF)
+    problem = body.problem(floor(body, fc.Coulomb(0.9)))
+    limit = 0.25 * weight * (1.0 - 2.0 * (0.5 - 0.5 / np.sqrt(3.0)) / n)
+    push.value = 0.99 * limit
+    problem.solve()
+    problem.commit()
+    push.value = 1.01 * limit
+    raised_everywhere(problem.solve, ValueError, "no contact force can balance")

@@ -351,7 +351,8 @@ class RigidBodyModes:
             operators: Of evaluated contacts, over all unknowns.
             closed_only: Whether the points at which contact acts now alone feel any, see
                 `is_constrained`.
-            slips: Whether those that slip feel no motion along their friction.
+            slips: Whether those that slip feel no motion along their friction, nor what the slopes
+                of flat surfaces add to it, those of bodies that are strained.
         """
         n_free = len(self.free)
         gram: Array = np.zeros((n_free, n_free))
@@ -373,7 +374,7 @@ class RigidBodyModes:
                 modes = modes - np.einsum("mqd,qd->mq", modes, way)[:, :, None] * way
             gram += tangential_gram(contact, modes, closed_only=closed_only)
         gram, area = global_sum(self.comm, gram), global_sum(self.comm, area)
-        return self._null_space(gram, area)
+        return self._null_space(gram, area, FLAT if slips else NEGLIGIBLE)
 
     def find_unloaded(
         self,
@@ -431,7 +432,7 @@ class RigidBodyModes:
         acts = forces > self._scales.round_off_at_points(number, forces.max(axis=0))
         return np.asarray(acts | (contact.law.has_tension & (values.paired > 0)))
 
-    def _null_space(self, gram: Array, area: Array) -> Array:
+    def _null_space(self, gram: Array, area: Array, least: float = NEGLIGIBLE) -> Array:
         """Combinations of free motions that a sum over points does not feel, (n_found, n_free).
 
         Collective.
@@ -439,6 +440,7 @@ class RigidBodyModes:
         Args:
             gram: Products of the motions by what is felt, weighted by area, (n_free, n_free).
             area: Of the points that feel each, (n_free,).
+            least: Mean square jump, relative to that of the motion, which counts as felt.
         """
         scale = 1 / np.sqrt(np.where(area > 0, area, 1.0))
         gram = gram * np.outer(scale, scale)
@@ -447,8 +449,8 @@ class RigidBodyModes:
         for group in np.unique(groups):  # no vector is of several
             mine = np.flatnonzero(groups == group)
             sizes, vectors = np.linalg.eigh(gram[np.ix_(mine, mine)])
-            found = np.zeros((np.count_nonzero(sizes < NEGLIGIBLE), n))
-            found[:, mine] = (vectors * scale[mine, None])[:, sizes < NEGLIGIBLE].T
+            found = np.zeros((np.count_nonzero(sizes < least), n))
+            found[:, mine] = (vectors * scale[mine, None])[:, sizes < least].T
             loose.append(found)
         return agreed(self.comm, np.concatenate(loose))
 
