@@ -175,14 +175,17 @@ class PointValues:
             if name.startswith("parameter ")
         }
         zero, zeros = (np.broadcast_to(0.0, shape) for shape in ((n,), (n, d)))
+        # What some laws have no use for; all else is always evaluated.
+        scalars = (
+            *("normal_reaction", "friction_bound_ratio", "circumradius", "friction_bound"),
+            *("bound_of_law", "friction_bound_slope", "dissipated", "multiplier", "depth"),
+        )
         vectors = ("slide", "traction", "increment", "old_traction", "elastic_slip")
-        found: dict[str, Any] = {field.name: zero for field in fields(cls)}
-        found |= dict.fromkeys(vectors, zeros) | {
-            "paired": np.broadcast_to(1.0, (n,)),
-            "normal_stiffness": parameters.get("k_n", zero),
-            "slip_increment": np.broadcast_to(0.0, (n, 0)),
-        }
-        found |= {name: arrays[name] for name in found if name in arrays}
+        found: dict[str, Any] = dict.fromkeys(scalars, zero) | dict.fromkeys(vectors, zeros)
+        found["paired"] = np.broadcast_to(1.0, (n,))
+        found["normal_stiffness"] = parameters.get("k_n", zero)
+        found["slip_increment"] = np.broadcast_to(0.0, (n, 0))
+        found |= {f.name: arrays[f.name] for f in fields(cls) if f.name in arrays}
         # With small displacements the history is in space.
         kept = {"foot": "jump", "framed_traction": "traction", "framed_normal": "normal"}
         kept |= {"carried_traction": "old_traction"}
