@@ -21,7 +21,14 @@ from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Mask
 
-__all__ = ["Deviation", "Linearisation", "Respond", "answer", "linearisation", "spring_stiffness"]
+__all__ = [
+    "Deviation",
+    "Linearisation",
+    "Respond",
+    "linearisation",
+    "spring_stiffness",
+    "traction_change",
+]
 
 # The change of the relative displacements at the points of every contact by springs there and by
 # tractions added on the body.
@@ -65,7 +72,7 @@ def spring_stiffness(contact: Contact) -> Array:
     return stiffness
 
 
-def answer(stiffness: Array, jump: Array) -> Array:
+def traction_change(stiffness: Array, jump: Array) -> Array:
     """Change of the traction by one of the relative displacement, (n_points, gdim) (stress)."""
     return -np.einsum("qij,qj->qi", stiffness, jump)
 
@@ -242,7 +249,7 @@ class Deviation:
         stiffness = np.where(lost[:, None], 0.0, spring_stiffness(contact)) + added
         turned = values.normal_traction[:, None] * self.turn
         along = np.where(self.closing[:, None], self.normal, values.normal)
-        change = turned + answer(stiffness, -self.gap[:, None] * along)
+        change = turned + traction_change(stiffness, -self.gap[:, None] * along)
         return stiffness, np.where(lost, -traction, change)
 
 
@@ -287,7 +294,7 @@ def linearisation(
     for c, parts, k, traction, jump, slide in zip(
         contacts, looked_at, stiffness, added, jumps, slides, strict=True
     ):
-        errors = [(0.0, 0.0)] + [_relative(c, p, traction, answer(k, jump)) for p in parts]
+        errors = [(0.0, 0.0)] + [_relative(c, p, traction, traction_change(k, jump)) for p in parts]
         force, pressure = np.max(errors, axis=0).tolist()  # one that is not a number wins
         rough = bool(parts) and not c.rigid
         found[c.name] = Linearisation(force, pressure, rough, *slide)

@@ -451,7 +451,7 @@ class Contact(PointResults):
 
         This is one augmentation of the augmented Lagrangian method: solve with `form` and call
         `augment` until the returned error is small enough, then call `commit`. `ContactProblem`
-        does so itself.
+        does so itself, and accelerates the augmentations of all its contacts.
 
         Returns:
             The `enforcement_error` before the update.

@@ -16,7 +16,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from fenics_contact.checks.kinematics import Deviation, answer, spring_stiffness
+from fenics_contact.checks.kinematics import Deviation, spring_stiffness, traction_change
 from fenics_contact.compiling import compile_form
 from fenics_contact.contact.choices import is_regularised
 from fenics_contact.contact.contact import Contact
@@ -298,7 +298,7 @@ def _linear_parts(
 
     def differences(way: Array, shifts: list[Array]) -> dict[str, float]:
         jumps = [shift + o.jump(way) for o, shift in zip(operators, shifts, strict=True)]
-        changes = [answer(k, jump) for k, jump in zip(springs, jumps, strict=True)]
+        changes = [traction_change(k, jump) for k, jump in zip(springs, jumps, strict=True)]
         return _differences(problem, values, changes, way)
 
     with problem.linearised(springs) as solve:
@@ -306,13 +306,13 @@ def _linear_parts(
         # The springs' rest lengths follow what they carry: a round of augmented enforcement.
         # It leaves 1/(1 + k_n h/E) of the error in the shortest waves and far less in the long ones
         # that forces are made of.
-        way = solve([answer(*both) for both in zip(springs, stretches, strict=True)])
+        way = solve([traction_change(*both) for both in zip(springs, stretches, strict=True)])
         found["enforcement"] = differences(way, stretches)
     moved = [Deviation.of(contact).linearised(contact) for contact in contacts]
     with problem.linearised([k for k, _ in moved]) as solve:
         way = solve([added for _, added in moved])
         pairs = zip(moved, operators, strict=True)
-        changes = [added + answer(k, o.jump(way)) for (k, added), o in pairs]
+        changes = [added + traction_change(k, o.jump(way)) for (k, added), o in pairs]
         found["kinematics"] = _differences(problem, values, changes, way)
     return found
 

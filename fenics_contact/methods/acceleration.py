@@ -1,10 +1,10 @@
 """Augmentations with Anderson acceleration, of all contacts of coupled bodies at once.
 
-An augmentation makes new multipliers of those before it. The next ones are the combination of those
-made, with coefficients that add up to 1, whose rests (what an augmentation changes), combined that
-way, are least (doi:10.1137/10078356X). What one contact is given changes what another makes, in a
-corner as much as what it makes itself: all contacts of bodies that may touch have the same
-coefficients.
+An augmentation is a fixed-point iteration for the multipliers, whose residual is what it changes.
+The next multipliers are the combination of the last results, with coefficients that add up to 1,
+for which the combination of their residuals is least (doi:10.1137/10078356X). The multipliers of
+one contact change what another bears, in a corner as much as what it bears itself: all contacts of
+bodies that may touch have the same coefficients.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from fenics_contact.types import Array
 
 __all__ = ["Acceleration"]
 
-# How many augmentations before the last are combined with it, and how well their rests are to be
-# told apart, relative and squared.
+# How many augmentations before the last are combined with it, and how well their residuals are to
+# be told apart, relative and squared.
 _DEPTH, _DISTINCT = 6, 1e-12
 
 
@@ -75,21 +75,21 @@ class Acceleration:
     def _combined(self, rounds: list[Array], weights: Array) -> Array:
         """Combine the last augmentations of one group. Collective.
 
-        A rest that is larger than the one before, as where points have changed their status, begins
-        a new sequence.
+        A residual that is larger than the one before, as where points have changed their status,
+        begins a new sequence.
 
         Args:
             rounds: What they were given and made, (2, n_points, n_columns) (stress) each; those
                 that are of no more use are dropped.
-            weights: Of the rests, (n_points, 1).
+            weights: Of the residuals, (n_points, 1).
 
         Returns:
             The next multipliers, (n_points, n_columns) (stress).
         """
         del rounds[: -1 - _DEPTH]
         given, made = np.swapaxes(rounds, 0, 1)
-        rests = made - given
-        scaled = weights * np.concatenate([np.diff(rests, axis=0), rests[-2:]])
+        residuals = made - given
+        scaled = weights * np.concatenate([np.diff(residuals, axis=0), residuals[-2:]])
         flat = scaled.reshape(len(scaled), -1)
         products = global_sum(self._comm, flat @ flat.T)
         if len(rounds) == 1 or products[-1, -1] > products[-2, -2]:
