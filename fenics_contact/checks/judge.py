@@ -60,7 +60,8 @@ class Judge:
         self._warned: dict[str, float] = {}
         self._inexact: set[str] = set()
         self._few: set[tuple[str, str]] = set()
-        products = np.einsum("bmi,bni->bmn", motions.of_bodies, motions.of_bodies)
+        products = np.array([motions.by_body(full, motion) for motion in motions.of_bodies])
+        products = np.moveaxis(products, 0, 2)
         # A body of one node has no rotations.
         self._inverse = np.linalg.pinv(global_sum(self._comm, products), hermitian=True)
 
@@ -171,13 +172,14 @@ class Judge:
 
         By what is prescribed, where Dirichlet values of the body differ by more than its size.
         """
-        full, scales, motions = self._full, self._full.scales, self._motions.of_bodies
+        full, scales, motions = self._full, self._full.scales, self._motions
         state = full.state()
-        rigid = np.einsum("bmn,bn->bm", self._inverse, global_sum(self._comm, motions @ state))
-        rest = scales.largest(state - np.einsum("bm,bmi->i", rigid, motions))
-        spread: Array = np.zeros(len(motions))
-        for along in np.swapaxes(motions[:, : full.gdim], 0, 1):
-            held = np.any(along != 0.0, axis=0) & full.constrained
+        sums = global_sum(self._comm, motions.by_body(full, state))
+        rigid = np.einsum("bmn,bn->bm", self._inverse, sums)
+        rest = scales.largest(state - motions.field(rigid))
+        spread: Array = np.zeros(len(rigid))
+        for along in motions.of_bodies[: full.gdim]:
+            held = (along != 0.0) & full.constrained
             spread = np.maximum(spread, scales.spread(state, held))
         found = rest / np.maximum(scales.size, spread)
         return dict(zip(full.parts.names, found.tolist(), strict=False))
@@ -199,8 +201,8 @@ class Judge:
             The sums, (n_bodies, n_per_body) (force), see `RigidBodyModes.work`; of every body the
             number of its unknowns, and the sum of the absolute forces, (2, n_bodies).
         """
-        motions, n = self._motions.of_bodies, len(self._motions.of_bodies)
-        total = np.array([[system.part(mode) @ internal for mode in body] for body in motions])
+        total = self._motions.by_body(system, internal)
+        n = len(total)
         for operator in self._full.operators:
             contact = operator.contact
             total -= self._motions.work(operator, contact.measure[:, None] * contact.traction)

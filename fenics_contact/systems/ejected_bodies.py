@@ -59,15 +59,16 @@ def find_ejected_bodies(
     unloaded = loose & idle
     if not unloaded.any():
         return {}
-    change, bodies = full.state() - began, motions.of_bodies[:, : full.gdim]
-    sums = np.column_stack([bodies @ change, bodies[:, 0].sum(axis=1)])
+    change = full.state() - began
+    shifts, counts = (motions.by_body(full, each) for each in (change, np.ones_like(change)))
+    sums = np.column_stack([shifts[:, : full.gdim], counts[:, 0]])
     sums = global_sum(full.unknowns.comm, sums)
     if not np.isfinite(sums).all():
         return {}  # a diverged state has no residual either
     translation = sums[:, :-1] / sums[:, -1:]
     # Of an unloaded body the change of its shape, its rotation, and what is prescribed.
     shift = np.where(unloaded[:, None], translation, 0.0)
-    other = change - np.where(full.constrained, 0.0, np.einsum("bd,bdi->i", shift, bodies))
+    other = change - np.where(full.constrained, 0.0, motions.field(shift))
     largest = scales.largest(other)
     opposite = _moved_opposite(full, change)
     around: Array = np.zeros(scales.n_groups)

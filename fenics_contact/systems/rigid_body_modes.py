@@ -17,6 +17,7 @@ from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.modes import rigid_motions
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.reference_scales import body_of_points
+from fenics_contact.systems.system import System
 from fenics_contact.tolerances import FLAT, NEGLIGIBLE, ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
@@ -34,9 +35,9 @@ class RigidBodyModes:
         names: Name of every motion, those of the bodies first.
         turns: Which of these turn a body, and the size of it by which the angle has to be
             multiplied to be one of order one (length); 0 for the others.
-        of_bodies: Their fields at this rank's unknowns, (n_bodies, n_per_body, n_local).
+        of_bodies: Translations, then rotations, of the undeformed bodies: at each of this rank's
+            unknowns those of its own body, (n_per_body, n_local).
         free: Coefficients of the free motions, shape (n_free, n_motions).
-        fields: Their fields at this rank's unknowns, of the undeformed bodies, (n_free, n_local).
     """
 
     def __init__(self, full: FullSystem) -> None:
@@ -61,36 +62,72 @@ class RigidBodyModes:
                 turns.append(self._sizes[b] if name.startswith("rotation") else 0.0)
         moving = [(contact.name, m) for contact in full.contacts for m in contact.motions]
         n_modes, n_obstacles = len(self.names), len(moving)
+        self._n_bodies = n_bodies
         self.names += [f"{m.kind} {m.way} of the obstacle of {name}" for name, m in moving]
         self.turns = np.array(turns + [0.0] * n_obstacles)
         # Rotations of obstacles, whose arms change with the state.
         self._turning = np.array([False] * n_modes + [m.turns for _, m in moving], dtype=np.bool_)
-        still = np.zeros(unknowns.n_dofs)
-        of_obstacles = [unknowns.joined(still, row) for row in np.eye(n_obstacles)]
-        self._of_obstacles = np.array(of_obstacles).reshape(n_obstacles, unknowns.n_local)
-        self._modes = self._modes_at(x)
-        shape = n_bodies, n_modes // n_bodies, unknowns.n_local
-        self.of_bodies = self._modes[:n_modes].reshape(shape)
-        self.free: Array = np.zeros((0, n_modes))
-        self.fields: Array = np.zeros((0, unknowns.n_local))
+        self.of_bodies = self._of_bodies_at(x)
+        self.free: Array = np.zeros((0, n_modes + n_obstacles))
         self._jumps: weakref.WeakKeyDictionary[ContactOperator, Array]
         self._jumps = weakref.WeakKeyDictionary()
-        self._travels: weakref.WeakKeyDictionary[ContactOperator, Array]
+        self._travels: weakref.WeakKeyDictionary[ContactOperator, list[tuple[Index, Array]]]
         self._travels = weakref.WeakKeyDictionary()
 
-    def _modes_at(self, x: Array) -> Array:
-        """All motions, with the nodes of this rank at places, (n_motions, n_local)."""
-        modes = []
-        for b, (centre, size) in enumerate(zip(self._centres, self._sizes, strict=True)):
-            mine = self._full.body[: len(x), None] == b
-            for mode in rigid_motions(x - centre, size).values():
-                modes.append(self._over_unknowns(np.where(mine, mode, 0.0)))
-        return np.concatenate([modes, self._of_obstacles])
+    def _of_bodies_at(self, x: Array) -> Array:
+        """`of_bodies`, with the nodes of this rank at places, (n_per_body, n_local)."""
+        body = self._full.body[: len(x)]
+        arm = (x - self._centres[body]) / self._sizes[body, None]
+        nothing = np.zeros(self._unknowns.n_motions)
+        motions = [self._over_unknowns(each, nothing) for each in rigid_motions(arm, 1.0).values()]
+        return np.array(motions)
 
-    def _over_unknowns(self, displacement: Array) -> Array:
-        """A displacement of this rank's nodes, (n_nodes, gdim), with obstacles at rest."""
-        none = np.zeros(len(self._of_obstacles))
-        return self._unknowns.joined(self._displacement.within(displacement.ravel()), none)
+    def _over_unknowns(self, displacement: Array, obstacles: Array) -> Array:
+        """Displacements of this rank's nodes, (n_nodes, gdim), and of the obstacles."""
+        return self._unknowns.joined(self._displacement.within(displacement.ravel()), obstacles)
+
+    def _by_part(self, coefficients: Array) -> tuple[Array, Array]:
+        """Coefficients of all motions by body, (n_bodies, n_per_body), and by obstacle."""
+        n_modes = self._n_bodies * len(self.of_bodies)
+        return coefficients[:n_modes].reshape(self._n_bodies, -1), coefficients[n_modes:]
+
+    def field(
+        self, by_body: Array, obstacles: Array | None = None, *, of_bodies: Array | None = None
+    ) -> Array:
+        """The displacement by motions, at this rank's unknowns, (n_local,).
+
+        Args:
+            by_body: Coefficients of the first k motions of every body, (n_bodies, k).
+            obstacles: Of the motions of obstacles; None: these are at rest.
+            of_bodies: Motions of the bodies, if not of the undeformed ones; see the attribute.
+        """
+        motions = self.of_bodies if of_bodies is None else of_bodies
+        n, label = self._unknowns.n_dofs, self._scales.label
+        dofs = np.einsum("im,mi->i", by_body[label[:n]], motions[: by_body.shape[1], :n])
+        still = np.zeros(self._unknowns.n_motions)
+        return self._unknowns.joined(dofs, still if obstacles is None else obstacles)
+
+    def by_body(self, system: System, values: Array, of_bodies: Array | None = None) -> Array:
+        """Sums of values times the motions of each body, this rank's part.
+
+        Args:
+            system: The unknowns.
+            values: At these.
+            of_bodies: See `field`.
+
+        Returns:
+            Array (n_bodies, n_per_body).
+        """
+        motions, n = self.of_bodies if of_bodies is None else of_bodies, self._n_bodies
+        products = [system.part(motion) * values for motion in motions]
+        return np.stack([np.bincount(system.label, p, minlength=n)[:n] for p in products], axis=1)
+
+    def _sums(self, values: Array, of_bodies: Array | None = None) -> Array:
+        """Sums of values at this rank's unknowns times all motions, (n_motions,)."""
+        obstacles = np.zeros(self._unknowns.n_motions)
+        if self._unknowns.has_motions_here:
+            obstacles[:] = values[self._unknowns.n_dofs :]
+        return np.append(self.by_body(self._full, values, of_bodies), obstacles)
 
     def find_free(self, stiffness: PETSc.Mat, constrained: Mask) -> None:
         """Find the motions with no bulk energy that no Dirichlet condition holds. Collective.
@@ -101,26 +138,28 @@ class RigidBodyModes:
             stiffness: Bulk tangent without conditions.
             constrained: Mask over this rank's unknowns.
         """
-        # Motions of obstacles have no bulk energy.
-        stiffest = np.append(self._scales.stiffness, np.ones(len(self._of_obstacles)))
-        stiffest = stiffest[self._scales.label]
-        gram = np.zeros((2, len(self._modes), len(self._modes)))
+        n_obstacles, system = self._unknowns.n_motions, self._full
+        stiffest = np.append(self._scales.stiffness, np.ones(n_obstacles))[self._scales.label]
+        gram = []
         work, image = stiffness.createVecs()
-        for j, mode in enumerate(self._modes):
-            work.array[:] = mode
+        for motion in self.of_bodies:
+            work.array[:] = motion  # of all bodies at once: the bulk does not couple them
             stiffness.mult(work, image)
-            held = np.where(constrained, mode, 0.0)
-            gram[0, :, j] = self._modes @ (image.array / stiffest + held)
-            gram[1, :, j] = self._modes @ mode
-        energy, mass = global_sum(self.comm, gram)
-        scale = 1 / np.sqrt(np.diag(mass))
-        values, vectors = np.linalg.eigh((energy + energy.T) / 2 * np.outer(scale, scale))
-        # One clamped dof among N gives 1/N, and round-off is below any.
-        free = agreed(self.comm, (vectors * scale[:, None])[:, values < ROUND_OFF])
+            held = np.where(constrained, motion, 0.0)
+            energy = self.by_body(system, image.array / stiffest + held)
+            gram.append([energy, self.by_body(system, motion)])
+        energy, mass = np.moveaxis(global_sum(self.comm, np.array(gram)), 0, 3)
+        free: list[Array] = []
+        for of_body, mass_of_body in zip(energy, mass, strict=True):
+            scale = 1 / np.sqrt(np.diag(mass_of_body))
+            symmetric = (of_body + of_body.T) / 2
+            values, vectors = np.linalg.eigh(symmetric * np.outer(scale, scale))
+            # One clamped dof among N gives 1/N, and round-off is below any.
+            free.append(_plain((vectors * scale[:, None])[:, values < ROUND_OFF].T))
         self._jumps.clear()
-        self.free = _plain(free.T)
+        # Motions of obstacles have no bulk energy.
+        self.free = agreed(self.comm, scipy.linalg.block_diag(*free, np.eye(n_obstacles)))
         self._scales.held = np.all(~np.hstack(self._moved()), axis=0)
-        self.fields = self.free @ self._modes
         for vector in (work, image):
             vector.destroy()
 
@@ -128,15 +167,15 @@ class RigidBodyModes:
         """Jumps of the free motions at a contact's points: (n_free, n_points, gdim). Collective."""
         if operator not in self._jumps or operator.contact.free_angle is not None:
             gdim, n_points = len(self._centres[0]), operator.contact.quadrature.n_points
-            found = [operator.jump(c @ self._modes) for c in self.free]
+            found = [operator.jump(self.field(*self._by_part(row))) for row in self.free]
             self._jumps[operator] = np.array(found).reshape(len(self.free), n_points, gdim)
         return self._jumps[operator]
 
     def _moved(self) -> tuple[Mask, Mask]:
         """Which bodies every free motion moves, (n_free, n_bodies), and which obstacles."""
-        n_bodies, n_motions, _ = self.of_bodies.shape
-        moves, n_modes = self.free != 0.0, n_bodies * n_motions
-        bodies = moves[:, :n_modes].reshape(-1, n_bodies, n_motions).any(axis=2)
+        n_per_body, moves = len(self.of_bodies), self.free != 0.0
+        n_modes = self._n_bodies * n_per_body
+        bodies = moves[:, :n_modes].reshape(-1, self._n_bodies, n_per_body).any(axis=2)
         return bodies, moves[:, n_modes:]
 
     def of_same_body(self) -> Mask:
@@ -188,21 +227,19 @@ class RigidBodyModes:
         Args:
             coefficients: Of the free motions, (n_free,) (length).
         """
-        n_bodies, n_motions, _ = self.of_bodies.shape
-        of_each = np.abs(coefficients @ self.free)[: n_bodies * n_motions]
-        return np.asarray(of_each.reshape(n_bodies, n_motions).sum(axis=1))
+        return np.abs(self._by_part(coefficients @ self.free)[0]).sum(axis=1)
 
     def present_fields(self) -> Array:
         """The free motions of the bodies where they are now, about the same centres.
 
-        `fields` where the bulk is linear: to it small rotations alone are rigid.
+        Where the bulk is linear, of the undeformed ones: to it small rotations alone are rigid.
 
         Returns:
             At this rank's unknowns, (n_free, n_local).
         """
-        if self._full.bulk.linear:
-            return self.fields
-        return np.asarray(self.free @ self._modes_at(self._places()), dtype=np.float64)
+        of_bodies = None if self._full.bulk.linear else self._of_bodies_at(self._places())
+        found = [self.field(*self._by_part(row), of_bodies=of_bodies) for row in self.free]
+        return np.array(found).reshape(len(self.free), self._unknowns.n_local)
 
     def _places(self) -> Array:
         """Of this rank's nodes now, (n_nodes, gdim) (length)."""
@@ -245,8 +282,9 @@ class RigidBodyModes:
         Args:
             coefficients: Of the free motions, (n_free,).
         """
+        of_all = coefficients @ self.free
         linear = self._full.bulk.linear
-        return coefficients @ self.fields if linear else self.turned(coefficients @ self.free)
+        return self.field(*self._by_part(of_all)) if linear else self.turned(of_all)
 
     def turned(self, coefficients: Array) -> Array:
         """By how much unknowns change as bodies go on, and turn about their centres, from here.
@@ -259,20 +297,18 @@ class RigidBodyModes:
         Returns:
             Over this rank's unknowns, (n_local,).
         """
-        x, (n_bodies, n_motions, _) = self._places(), self.of_bodies.shape
+        x, (by_body, obstacles) = self._places(), self._by_part(coefficients)
         way, d = np.zeros_like(x), x.shape[1]
-        for b in range(n_bodies):
+        for b, of_body in enumerate(by_body):
             twist = np.zeros((d + 1, d + 1))  # of homogeneous coordinates
             here = np.vstack([np.zeros(d), np.eye(d)])
             kinds = np.array(list(rigid_motions(here, self._sizes[b]).values()))
-            by_motion = coefficients[b * n_motions : (b + 1) * n_motions]
-            at = np.tensordot(by_motion, kinds, axes=1)
+            at = np.tensordot(of_body, kinds, axes=1)
             twist[:d, d], twist[:d, :d] = at[0], (at[1:] - at[0]).T
             change = scipy.linalg.expm(twist)[:d] - np.eye(d + 1)[:d]
             mine = self._full.body[: len(x)] == b
             way[mine] = (x[mine] - self._centres[b]) @ change[:, :d].T + change[:, d]
-        obstacles = coefficients[n_bodies * n_motions :] @ self._of_obstacles
-        return np.asarray(self._over_unknowns(way) + obstacles, dtype=np.float64)
+        return self._over_unknowns(way, obstacles)
 
     def work(self, operator: ContactOperator, force: Array) -> Array:
         """Of forces at a contact's points, and of what answers them, on the motions of the bodies.
@@ -290,30 +326,35 @@ class RigidBodyModes:
         """
         if operator not in self._travels:
             self._travels[operator] = self._travels_at(operator)
-        travels = self._travels[operator]
-        return np.asarray(np.einsum("bmqd,qd->bm", travels, force), dtype=np.float64)
+        found: Array = np.zeros((self._n_bodies, len(self.of_bodies)))
+        for body, travels in self._travels[operator]:
+            np.add.at(found, body, np.einsum("mqd,qd->qm", travels, force))
+        return found
 
-    def _travels_at(self, operator: ContactOperator) -> Array:
-        """What points of a contact feel of the bodies' motions, (n_bodies, n_per_body, ...)."""
-        space, (n_bodies, n_motions, _) = self._displacement.u.function_space, self.of_bodies.shape
-        contact = operator.contact
-        points = contact.points
-        travels = np.zeros((n_bodies, n_motions, *points.shape))
+    def _travels_at(self, operator: ContactOperator) -> list[tuple[Index, Array]]:
+        """Bodies on both sides of points, and what these feel of their motions. Collective.
+
+        Returns:
+            Arrays (n_points,) and (n_per_body, n_points, gdim) for every side.
+        """
+        space, contact = self._displacement.u.function_space, operator.contact
         own = body_of_points(contact, space, self._full.body)
-        for b in range(n_bodies):
-            placed = rigid_motions(points - self._centres[b], self._sizes[b])
-            travels[b] = np.where((own == b)[:, None], np.array(list(placed.values())), 0.0)
-            if contact.rigid:
-                continue
+        arm = (contact.points - self._centres[own]) / self._sizes[own, None]
+        travels = np.array(list(rigid_motions(arm, 1.0).values()))
+        sides = [(own, travels)]
+        if not contact.rigid:
             # The map says where the forces on the opposite act. Both sides may be one body's.
             # A point without an opposite feels none: a traction there would be left over.
-            felt = np.array([operator.jump(mode) for mode in self.of_bodies[b]])
-            there = contact.paired & ((own != b) | (np.abs(felt[0, :, 0]) < 0.5))
-            travels[b] = np.where(there[:, None], felt, travels[b])
+            felt = np.array([operator.jump(motion) for motion in self.of_bodies])
+            difference = operator.jump(self._scales.label.astype(np.float64))[:, 0]
+            paired = contact.paired[:, None]
+            opposite = np.where(contact.paired, own - np.rint(difference).astype(np.intp), own)
+            sides.append((opposite, np.where(paired, felt - travels, 0.0)))
         if compat.geometry_element(space.mesh).degree > space.ufl_element().degree:
             # Straight displacements of curved cells have no rotations.
-            travels[:, space.mesh.geometry.dim :] = np.nan
-        return travels
+            for _, each in sides:
+                each[space.mesh.geometry.dim :] = np.nan
+        return sides
 
     def describe(self, coefficients: Array) -> str:
         """Name a motion by its share of each of all motions, (n_motions,)."""
@@ -465,7 +506,7 @@ class RigidBodyModes:
 
     def generalised_forces(self, forces: Array) -> Array:
         """Work of forces at this rank's unknowns on the free motions, (n_free,). Collective."""
-        return global_sum(self.comm, self.fields @ forces)
+        return global_sum(self.comm, self.free @ self._sums(forces))
 
     def load_resultant(
         self, load: Array, operators: Sequence[ContactOperator]
@@ -483,7 +524,8 @@ class RigidBodyModes:
             along the mode: (n_straight,) (force).
         """
         rows = self.straight()
-        sums = np.stack([self.fields @ load, np.abs(self.fields) @ np.abs(load)])[:, rows]
+        at_most = self._sums(np.abs(load), np.abs(self.of_bodies))
+        sums = np.stack([self.free @ self._sums(load), np.abs(self.free) @ at_most])[:, rows]
         for operator in operators:
             contact = operator.contact
             if not contact.law.has_normal_stiffness:
