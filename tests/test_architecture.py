@@ -37,7 +37,7 @@ APART = {"methods": {"checks"}}
 # Modules that stand in no room and know none of them.
 GROUND = {
     *("compat", "parallel", "types", "meshes", "joining", "arguments", "elasticity", "markup"),
-    *("_version", "compiling", "installation", "tolerances"),
+    *("_version", "compiling", "installation", "tolerances", "wording"),
 }
 # DOLFINx names its C++ objects so, and there is no other way to them.
 OF_DOLFINX = {"_cpp_object"}

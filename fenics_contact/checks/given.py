@@ -21,6 +21,7 @@ from fenics_contact.surface.facets import facet_nodes
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Mask
+from fenics_contact.wording import place_in_words
 
 __all__ = [
     "check_contacts",
@@ -262,7 +263,7 @@ def _refuse_enclosed(contact: Contact) -> None:
     if first < len(feet):
         raise ValueError(
             f"{contact.name}: the obstacle is inside of the undeformed body, as at "
-            f"{np.round(feet[first], 6).tolist()}, and all of the body's Γc faces away from it: "
+            f"{place_in_words(feet[first])}, and all of the body's Γc faces away from it: "
             "check its place, its units and the direction of its normal"
         )
 

@@ -22,6 +22,7 @@ from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.system import System
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array
+from fenics_contact.wording import percent
 
 __all__ = ["Judge"]
 
@@ -154,7 +155,7 @@ class Judge:
                 warn(
                     self._comm,
                     f"{name}: round-off of its displacements leaves a residual of "
-                    f"{100 * share:.2g} % of the forces on it, the possible error of its stresses "
+                    f"{percent(share)} of the forces on it, the possible error of its stresses "
                     "and reactions; contact forces are as accurate as on the softer bodies in "
                     "contact with it. A smaller stiffness of this body reduces it",
                 )

@@ -20,6 +20,7 @@ from fenics_contact.parallel import global_mean, global_min, global_sum, longest
 from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Mask
+from fenics_contact.wording import percent
 
 __all__ = [
     "Deviation",
@@ -138,8 +139,8 @@ class Linearisation:
             error = (
                 "displacements are too large for the small-displacement assumption: with gap and "
                 "normals of the deformed bodies, the contact force would differ by "
-                f"{100 * self.force:.2g} % and the pressure by {100 * self.pressure:.2g} %, above "
-                f"{100 * tolerance:.2g} %. Use smaller increments, move the obstacle instead of "
+                f"{percent(self.force)} and the pressure by {percent(self.pressure)}, above "
+                f"{percent(tolerance)}. Use smaller increments, move the obstacle instead of "
                 'the body, update the pairs (update_pairs="increment"), use '
                 'Contact(kinematics="finite"), or accept the error: '
                 "ContactProblem(small_displacement_tolerance=inf)"
@@ -173,8 +174,8 @@ class Linearisation:
     def describe(self) -> str:
         """Return the errors in words."""
         return (
-            f"the contact force would differ by {100 * self.force:.2g} % and the pressure by "
-            f"{100 * self.pressure:.2g} %"
+            f"the contact force would differ by {percent(self.force)} and the pressure by "
+            f"{percent(self.pressure)}"
         )
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_max, global_sum, warn
 from fenics_contact.surface.surface import POINTS_PER_RADIUS
+from fenics_contact.wording import percent
 
 __all__ = ["warn_of_divided_facets", "warn_of_few_points"]
 
@@ -44,7 +45,7 @@ def warn_of_few_points(contact: Contact) -> bool:
     points = quadrature.default_degree(contact.displacement.degree) + 2
     warn(
         comm,
-        f"{contact.name}: facets of Γc with {100 * borne / whole:.2g} % of the normal force are "
+        f"{contact.name}: facets of Γc with {percent(borne / whole)} of the normal force are "
         f"{most:.2g} times as long as the radius of curvature of the obstacle, which their "
         "quadrature points do not resolve: the force is inaccurate. Use smaller facets, or "
         f"ContactSurface(quadrature_degree={round(POINTS_PER_RADIUS * most) * points - 2})",
@@ -77,8 +78,8 @@ def warn_of_divided_facets(contact: Contact) -> bool:
     warn(
         comm,
         f"{contact.name}: facets of Γc over which the opposite surface ends carry "
-        f"{100 * borne / whole:.2g} % of the normal force. Their quadrature points do not resolve "
-        f"where it ends: the error of the force may be {100 * doubtful / whole:.2g} %. Swap the "
+        f"{percent(borne / whole)} of the normal force. Their quadrature points do not resolve "
+        f"where it ends: the error of the force may be {percent(doubtful / whole)}. Swap the "
         "surfaces, so that all points of Γc have an opposite point, or use smaller facets or a "
         "larger ContactSurface(quadrature_degree=...)",
     )

@@ -27,6 +27,7 @@ from fenics_contact.checks.penetration import Probe, ResistedDepth
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import gather_rows
 from fenics_contact.types import Array
+from fenics_contact.wording import place_in_words
 
 __all__ = ["Tunnelling", "TunnellingCheck"]
 
@@ -71,26 +72,21 @@ class Tunnelling:
         """The conditions on a contact of this name."""
         deep = (
             f"{contact}: what lies opposite penetrates between the quadrature points of Γc, by "
-            f"{self.depth:.3e} near {_rounded(self.place)} in the undeformed body, where the "
-            f"points around explain {self.allowed:.3e}; refine Γc there or give ContactSurface a "
-            "larger quadrature_degree; between two bodies let the finer surface be Γc, or add a "
-            "second contact with the surfaces swapped"
+            f"{self.depth:.3e} near {place_in_words(self.place or [])} in the undeformed body, "
+            f"where the points around explain {self.allowed:.3e}; refine Γc there or give "
+            "ContactSurface a larger quadrature_degree; between two bodies let the finer surface "
+            "be Γc, or add a second contact with the surfaces swapped"
         )
         through = (
             f"{contact}: in one increment a part of Γc has crossed what lies opposite, at "
-            f"{_rounded(self.crossed)} in the undeformed body; load in smaller steps (increments() "
-            "cuts them by itself), and include in Γc and in the opposite surface all sides that "
-            "may touch"
+            f"{place_in_words(self.crossed or [])} in the undeformed body; load in smaller steps "
+            "(increments() cuts them by itself), and include in Γc and in the opposite surface all "
+            "sides that may touch"
         )
         return [
             Condition(f"penetration between points, {contact}", self.depth, self.allowed, deep),
             Condition(f"tunnelling, {contact}", float(self.crossed is not None), 0.0, through),
         ]
-
-
-def _rounded(place: list[float] | None) -> list[float]:
-    """A place as it is said."""
-    return [] if place is None else [float(x) for x in np.round(place, 6)]
 
 
 class TunnellingCheck:

@@ -15,6 +15,7 @@ from fenics_contact.markup import shown
 from fenics_contact.parallel import global_max, global_min, longest
 from fenics_contact.systems.balance import MOST_EXCUSED
 from fenics_contact.types import Array
+from fenics_contact.wording import percent
 
 __all__ = ["ForceBalance", "Verdict", "check_laws"]
 
@@ -253,7 +254,7 @@ class Verdict:
             )
             found.append(Condition(f"enforcement, {contact}", error, allowed, failure))
         failure = (
-            f"friction supplies energy, {100 * self.friction_energy_gain:.2g} % of the energy "
+            f"friction supplies energy, {percent(self.friction_energy_gain)} of the energy "
             "exchanged: the equations have several solutions, and this one is not reached by a "
             "continuous load path. Use smaller increments (increments() halves them where needed)"
         )

@@ -20,6 +20,7 @@ from fenics_contact.systems.reference_scales import body_of_points
 from fenics_contact.systems.system import System
 from fenics_contact.tolerances import FLAT, NEGLIGIBLE, ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
+from fenics_contact.wording import place_in_words
 
 __all__ = ["RigidBodyModes", "tangential_gram"]
 
@@ -56,7 +57,7 @@ class RigidBodyModes:
         self.names: list[str] = []
         turns: list[float] = []
         for b in range(n_bodies):
-            of = f" of body {b + 1}, near {np.round(self._centres[b], 6).tolist()}"
+            of = f" of body {b + 1}, near {place_in_words(self._centres[b])}"
             for name in rigid_motions(x[:0], 1.0):
                 self.names.append(name + (of if n_bodies > 1 else ""))
                 turns.append(self._sizes[b] if name.startswith("rotation") else 0.0)
