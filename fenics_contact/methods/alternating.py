@@ -24,7 +24,7 @@ from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.methods.limit_analysis import CLEARLY
-from fenics_contact.methods.method import OVERLOADED, OwnMethod, SnesMethod, Tools
+from fenics_contact.methods.method import OwnMethod, SnesMethod, Tools
 from fenics_contact.types import Array
 
 __all__ = ["Alternation"]
@@ -82,6 +82,16 @@ class Alternation(OwnMethod):
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`. Iterations are Newton's, in all."""
+        return self._iterate()
+
+    def diagnose(self) -> tuple[int, int]:
+        """Find an `Equations.overload`, if there is one: with pressures of an equilibrium.
+
+        Collective. It ends where the load needs no more friction than a cycle has found.
+        """
+        return self._iterate(diagnosis=True)
+
+    def _iterate(self, *, diagnosis: bool = False) -> tuple[int, int]:
         equations = self._equations
         if not self.suits:
             return 0, int(_REASONS.DIVERGED_LINE_SEARCH)
@@ -94,13 +104,17 @@ class Alternation(OwnMethod):
             residual = self._residual()
             bound: Array = self._friction_bound()
             for cycle in range(_MAX_CYCLES):
-                needed = equations.friction_needed()
+                overload = equations.find_overload()
+                needed = overload.factor if overload else 1.0
                 overloads = overloads + 1 if 1.0 < needed < np.inf else 0
+                if diagnosis and cycle and not overloads:
+                    return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
                 # Limits that the pressure does not set are what they are.
                 enough = 1 if equations.has_potential else 2 if needed > CLEARLY else _OVERLOADS
                 if overloads >= enough:
                     logger.debug("%d cycles, %d Newton iterations: overload", cycle, iterations)
-                    return iterations, OVERLOADED
+                    equations.overload = overload
+                    return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
                 if overloads:
                     bound = _MORE * needed * bound
                 ends = np.cumsum([c.quadrature.n_points for c in equations.contacts])[:-1]

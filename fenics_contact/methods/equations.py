@@ -64,7 +64,7 @@ class Equations:
         loads: The largest generalised force of the load on rigid-body modes, (n_groups,) (force).
         regularised_modes: Rigid-body modes along which the consistent tangent assembled last is
             regularised, in all motions, (n_modes, n_motions).
-        overload: By what the load outdid friction where `friction_needed` looked last, if it did.
+        overload: By what the load outdoes friction, where a method has found that it does.
     """
 
     def __init__(
@@ -164,17 +164,11 @@ class Equations:
         """Whether the residual computed last ends the present round, or is below ``rtol``."""
         return self.norms.within(max(self.rtol, self.round_rtol, rtol))
 
-    def friction_needed(self) -> float:
-        """How many times the friction by the pressures evaluated last the load needs. Collective.
-
-        1 where it can be borne, or nothing can be told; infinite where there is no friction at all;
-        see `find_overload`.
-        """
-        self.overload = None
-        if self._bulk.linear:  # a deformation may turn the loads on another, and what holds it
-            load, operators = self.full.load, self.full.operators
-            self.overload = find_overload(self.motions, operators, load)
-        return self.overload.factor if self.overload else 1.0
+    def find_overload(self) -> Overload | None:
+        """See `find_overload`, by the pressures evaluated last; of linear bodies. Collective."""
+        if not self._bulk.linear:  # a deformation may turn the loads on another, and what holds it
+            return None
+        return find_overload(self.motions, self.full.operators, self.full.load)
 
     # ---- matrices --------------------------------------------------------------------------------
 

@@ -18,7 +18,7 @@ from fenics_contact.methods.options import Defaults
 from fenics_contact.systems import linear
 from fenics_contact.types import Array
 
-__all__ = ["OVERLOADED", "Method", "Newton", "OwnMethod", "SnesMethod", "Tools"]
+__all__ = ["Method", "Newton", "OwnMethod", "SnesMethod", "Tools"]
 
 # Least decrease of the level function along a step. Without any, Newton's method cycled between two
 # states whose levels were 0.93 and 0.96 of each other's; with a quarter (Deuflhard's restricted
@@ -30,9 +30,6 @@ _WHOLE = 0.9
 _PATIENCE = 14
 
 _REASONS = PETSc.SNES.ConvergedReason
-# Why a method ends that has found an `Equations.overload`: SNES has no such reason, and does not
-# use this one in the methods here.
-OVERLOADED = int(_REASONS.DIVERGED_LOCAL_MIN)
 
 
 class Method(ABC):

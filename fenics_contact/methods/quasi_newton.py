@@ -10,7 +10,6 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.methods.equations import Equations
-from fenics_contact.methods.limit_analysis import CLEARLY
 from fenics_contact.methods.method import SnesMethod
 
 __all__ = ["QuasiNewton"]
@@ -18,8 +17,7 @@ __all__ = ["QuasiNewton"]
 # Rounds in a row that do not lower the residual before the increment is given up: the potential may
 # fall for long before the residual does.
 _MAX_STALLS = 10
-# The same where friction seems not to bear the load, which another method can tell; if that is
-# clear, one is enough.
+# The same where friction does not bear the load by the present pressures.
 _FEW_STALLS = 3
 # Contact that bears less than this share of the residual an increment begins with tells nothing of
 # which points will be closed.
@@ -103,10 +101,9 @@ class QuasiNewton(SnesMethod):
                 return iterations, failure
             if not self._refresh():
                 return iterations, compat.NOT_FINITE
-            if stalls and self.gives_up():
-                most = 1.0 if stalls >= _FEW_STALLS else CLEARLY
-                if equations.friction_needed() > most:
-                    return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
+            overloaded = stalls >= _FEW_STALLS and equations.find_overload() is not None
+            if overloaded and self.gives_up():
+                return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
 
     def _start(self, *, idle: bool) -> None:
         """Begin with H₀ of the status at the start, or of all of Γc where that tells nothing.

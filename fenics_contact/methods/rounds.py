@@ -11,7 +11,6 @@ import numpy as np
 from fenics_contact.methods.acceleration import Acceleration
 from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.equations import Equations
-from fenics_contact.methods.method import OVERLOADED
 from fenics_contact.parallel import global_sum
 from fenics_contact.systems.answered import leave_out_unanswered
 from fenics_contact.types import Array
@@ -65,7 +64,7 @@ def solve_in_rounds(
             start = equations.system.state()
             reason, tried = iterate(number == 1)
             _append(attempts, tried)
-            overloaded = reason == OVERLOADED
+            overloaded = equations.overload is not None
             if reason <= 0 and not overloaded:
                 break
             for operator in equations.full.operators:
@@ -81,7 +80,7 @@ def solve_in_rounds(
             # less friction: an overload is none before the multipliers bear what springs cannot.
             # Soft ones take over no more in a round than their stiffness by the bulk's of the rest.
             share = min(1.0, equations.hardness()) if overloaded else 1.0
-            if overloaded and equations.overload is not None:
+            if equations.overload is not None:
                 grows = max(errors) / share
                 if grows < _SURELY * (equations.overload.factor - 1.0) < np.inf:
                     break

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,7 +23,7 @@ from fenics_contact.methods.continuation import Continuation
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.kept import Kept
 from fenics_contact.methods.load_balance import LoadBalance
-from fenics_contact.methods.method import OVERLOADED, Method, Newton, OwnMethod, SnesMethod, Tools
+from fenics_contact.methods.method import Method, Newton, OwnMethod, SnesMethod, Tools
 from fenics_contact.methods.neighbourhood import linearised, respond
 from fenics_contact.methods.options import Defaults, take_command_line
 from fenics_contact.methods.primal_dual import PrimalDual
@@ -87,10 +87,11 @@ METHODS: dict[str, type[Method]] = {
     "continuation": Continuation,
 }
 # What takes over where a method fails: the first is for the stiffest friction, in few iterations,
-# the second for all else. The third tells whether friction can bear the load. Behind the others it
-# solved none of 420 random scenes, but it finds overloads that no start shows: of a tight fit in
-# the first round of multipliers, whose springs are soft.
-_FALLBACKS, _DIAGNOSIS = ("primal_dual", "continuation"), "alternating"
+# the second for all else.
+_FALLBACKS = ("primal_dual", "continuation")
+# What tells whether friction can bear the load, after the first failure. Behind the others it
+# solved none of 420 random scenes.
+_DIAGNOSIS = "alternating"
 
 
 @dataclass(frozen=True)
@@ -477,22 +478,20 @@ class Solver:
         chosen = self.starts.choose(first_round=first_round, cold=cold)
         start: Array = np.divide(chosen, equations.length)
         attempts: list[Attempt] = []
-        chain = [self.method]
-        for method in chain:
+        equations.overload = None
+        for method, solve in self._chain(start, fallback=fallback, balance=balance):
             equations.solution.array[:] = start
             equations.watch.start()
             if stiffness_changed:
                 equations.h0_is_made = False
-            iterations, reason = self.methods.get(method, self.main).solve()
+            iterations, reason = solve()
             attempts.append(Attempt(method, iterations, self._outcome(reason)))
             if reason > 0:
                 break
             if self._comm.rank == 0:
                 logger.info("%s", attempts[-1])
-            if reason == OVERLOADED:
+            if equations.overload is not None:
                 break
-            if fallback and len(attempts) == 1:
-                chain += self._fallbacks(start, balance=balance)
         equations.set_state(equations.solution)
         own = self.methods.get(method)
         newton = (self._factors if own is None else own.by_newton) and not self._quasi_newton
@@ -503,38 +502,41 @@ class Solver:
             self.starts.keep(predict=own is None or not self._full.bulk.linear)
         return int(reason), attempts
 
-    def _fallbacks(self, start: Array, *, balance: bool) -> list[str]:
-        """What is tried after a failure, in this order, if loads can be balanced. Collective.
-
-        Minimisation problems, which tell whether friction can bear the load, come first where the
-        pressures at the start say that it cannot; pressures of a failed iterate tell nothing.
+    def _chain(
+        self, start: Array, *, fallback: bool, balance: bool
+    ) -> Iterator[tuple[str, Callable[[], tuple[int, int]]]]:
+        """The method, and after it the diagnosis and the fallbacks, each if it suits. Collective.
 
         Raises:
             ValueError: Contact cannot balance the load on a nonlinear body (`LoadBalance.check`),
                 which may change as the body deforms: it is checked after a failure alone.
         """
-        equations, goes_on = self.equations, self.may_go_on()
-        if self._full.bulk.linear and not goes_on:
-            return []
-        x = equations.solution.copy()
-        x.array[:] = start
-        equations.set_state(x)
-        x.destroy()
-        self._full.evaluate()
-        if balance and not self._full.bulk.linear:
+        equations, linear_bulk = self.equations, self._full.bulk.linear
+        yield self.method, self.methods.get(self.method, self.main).solve
+        if not fallback:
+            return
+        if balance and not linear_bulk:
+            x = equations.solution.copy()
+            x.array[:] = start
+            equations.set_state(x)
+            x.destroy()
+            self._full.evaluate()
             LoadBalance(equations.motions).check(self._full.load, self._full.operators)
-        if not goes_on:
-            return []
-        overloaded = equations.friction_needed() > 1.0
-        order = (_DIAGNOSIS, *_FALLBACKS) if overloaded else (*_FALLBACKS, _DIAGNOSIS)
-        return [name for name in order if name != self.method and self.methods[name].suits]
+        if not self.may_go_on():
+            return
+        diagnosis = self.methods[_DIAGNOSIS]
+        assert isinstance(diagnosis, Alternation)
+        if linear_bulk and diagnosis.suits and self.method != _DIAGNOSIS:
+            yield _DIAGNOSIS, diagnosis.diagnose
+        for name in _FALLBACKS:
+            if name != self.method and self.methods[name].suits:
+                yield name, self.methods[name].solve
 
     def _outcome(self, reason: int) -> str:
         """What became of an attempt, in words. Collective."""
         if reason > 0:
             return "converged"
-        overload = self.equations.overload
-        if reason == OVERLOADED and overload is not None:
+        if (overload := self.equations.overload) is not None:
             return overload.in_words()
         words = _OUTCOMES.get(reason, f"SNES reason {reason}")
         return "; ".join(filter(None, (words, self.equations.watch.chattering())))
