@@ -83,6 +83,22 @@ def test_a_bond_led_back_to_no_load(cell, condensation):
         assert close(1e3 * opening * np.exp(-opening / 1e-2), pull * _ones(contact), EXACT, scale=1)
 
 
+def test_pressures_that_fall_by_a_factor_in_each_iteration():
+    """Loaded from a gap of H by Newton's method alone: the first step ends 60 H too deep.
+
+    From there an exponential falls by e in every iteration. Reference: the closed form of the gap
+    under a pressure, to the residual's 1e-9 of it.
+    """
+    scene = block("quadrilateral", E=1000.0, nu=0.0)
+    apart = {"obstacle": fc.HalfSpace((0.0, -H), (0.0, 1.0))}
+    problem, contact = scene.problem(
+        Overclosure(P0, H), scene.rollers(), contact=apart, method="newton", fallback=False
+    )
+    scene.load(up=-25.0 * P0)
+    problem.solve()
+    assert contact.gap == pytest.approx(-H * np.log(25.0), rel=1e-8)
+
+
 def test_any_units():
     """The same in MPa and in Pa, in metres and in micrometres: relative results are equal."""
     found = []

@@ -23,7 +23,8 @@ class ActiveSetMonitor:
     """Looks at the status of all points from iteration to iteration.
 
     Attributes:
-        idle: Looks since the residual last fell.
+        idle: Looks at which the residual had not fallen, neither below its least nor below that at
+            the look before, since it was at its least.
         tractions: Of every contact at the first look, (n_points, gdim) (stress).
     """
 
@@ -31,7 +32,7 @@ class ActiveSetMonitor:
         """Take the contacts to look at."""
         self._contacts = contacts
         n = sum(c.quadrature.n_points for c in contacts)
-        self.idle, self._best = 0, np.inf
+        self.idle, self._best, self._last = 0, np.inf, np.inf
         self.tractions: list[Array] = []
         self._status = np.full(n, -1, dtype=np.int8)
         self._changes = np.zeros(n, dtype=np.int64)
@@ -39,7 +40,7 @@ class ActiveSetMonitor:
 
     def start(self) -> None:
         """Forget what was seen."""
-        self.idle, self._best, self.tractions = 0, np.inf, []
+        self.idle, self._best, self._last, self.tractions = 0, np.inf, np.inf, []
         self._status[:], self._changes[:], self._seen[:] = -1, 0, False
 
     def note(self, residual: float) -> None:
@@ -58,10 +59,10 @@ class ActiveSetMonitor:
             self._best, self.idle = residual, 0
             self._changes[:], self._seen = 0, seen
         else:
-            self.idle += 1
+            self.idle += int(not residual < _FALL * self._last)
             self._changes += status != self._status
             self._seen |= seen
-        self._status = status
+        self._status, self._last = status, residual
 
     def chattering(self) -> str:
         """How many points chatter, between what and where; empty if none does. Collective."""
