@@ -275,7 +275,7 @@ class IncrementSolver:
                 return False
         # Of nodes that the quadrature points do not carry only a complete u tells where they are.
         carried = (
-            c.opposite.sampler is None or c.facet_places.points_are_nodes for c in self._contacts
+            c.opposite.sampler is None or c.facet_places.points_carry_nodes for c in self._contacts
         )
         if not all(carried):
             return False

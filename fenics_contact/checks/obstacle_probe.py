@@ -71,8 +71,7 @@ class RigidObstacleProbe(ObstaclePaths):
         self.x, _ = places.facets.positions(self.facet, self.reference)
         self.z = self._at(self.field)
         # What the points do not carry of the displacement they do not explain either.
-        carried = places.points_are_nodes
-        self._explained = self.z if carried else self._at(self._in_frame(contact, None))
+        self._explained = self._at(self._in_frame(contact, None))
         closed = contact.status != Status.OPEN
         # A penetration that the law knows of is its own matter, with no stiffness as well.
         deep = np.maximum(values.penetration, np.where(closed, -self._gap, 0.0))[places.rows]

@@ -97,12 +97,12 @@ class FacetSet:
         self._basis = space.element.basix_element
         self._nodes = compat.geometry_dofmap(mesh)[self.cells]
         self._dofs = space.dofmap.list[self.cells]
-        on_facet, tangents = self.positions(*self._each(self._middle))
+        on_facet, tangents = self.positions(*self.each(self._middle))
         table = tabulate(self._geometry_basis, 0, geometry.mean(axis=0)[None])[0, 0, :, 0]
         inside = np.einsum("k,pkd->pd", table, self._x[self._nodes][:, :, :d])
         self.outward = _side(tangents, on_facet - inside)
 
-    def _each(self, places: Array, facets: Index | None = None) -> tuple[Index, Array]:
+    def each(self, places: Array, facets: Index | None = None) -> tuple[Index, Array]:
         """Facets, by default all, with each of the places, (m, d - 1): (n m,), (n m, d - 1)."""
         facets = np.arange(len(self.cells)) if facets is None else facets
         return np.repeat(facets, len(places)), np.tile(places, (len(facets), 1))
@@ -153,22 +153,22 @@ class FacetSet:
 
     def moved_corners(self, u: fem.Function | None) -> Array:
         """Corners displaced by ``u``, (n_facets, n_corners, d)."""
-        places, _ = self.positions(*self._each(self._corners), u)
+        places, _ = self.positions(*self.each(self._corners), u)
         return places.reshape(len(self.cells), len(self._corners), self._d)
 
     def balls(self, u: fem.Function | None) -> tuple[Array, Array]:
         """Balls around the facets displaced by ``u``: middles, (n_facets, d), and radii."""
-        middle, _ = self.positions(*self._each(self._middle), u)
+        middle, _ = self.positions(*self.each(self._middle), u)
         away = np.linalg.norm(self.moved_corners(u) - middle[:, None], axis=2)
         return middle, _BENT * away.max(axis=1, initial=0.0)
 
     def mean_normals(self) -> Array:
         """Outward unit normals at the facets' middles, (n_facets, d)."""
-        return self.normals(*self._each(self._middle))
+        return self.normals(*self.each(self._middle))
 
     def corners(self) -> tuple[Index, Array]:
         """Every facet with each of its corners and its middle: (n,), places (n, d - 1)."""
-        return self._each(np.vstack([self._corners, self._middle]))
+        return self.each(np.vstack([self._corners, self._middle]))
 
     def lattice(self, facets: Index | None = None) -> tuple[Index, Array]:
         """Facets with their corners, the middles of their edges and their own middle.
@@ -183,15 +183,7 @@ class FacetSet:
         if self._d == 3:
             edges = (self._corners + np.roll(self._corners, -1, axis=0)) / 2
             places = np.vstack([places, edges])
-        return self._each(places, facets)
-
-    def interpolation_nodes(self, degree: int) -> Array:
-        """Reference coordinates on a facet of the nodes of polynomials, (n, d - 1).
-
-        Args:
-            degree: Of the polynomials.
-        """
-        return basix.create_lattice(self.kind, degree, basix.LatticeType.equispaced, True)
+        return self.each(places, facets)
 
     def flat_pieces(self, degree: int) -> Array:
         """Reference corners of the pieces, in order, that are taken as flat: (n, n_corners, d - 1).
@@ -224,7 +216,7 @@ class FacetSet:
 
     def heights(self) -> Array:
         """How far the cells reach below their facets, (n_facets,) (length)."""
-        middle, _ = self.positions(*self._each(self._middle))
+        middle, _ = self.positions(*self.each(self._middle))
         arm = middle[:, None] - self._x[self._nodes][:, :, : self._d]
         depth: Array = np.einsum("fkd,fd->fk", arm, self.mean_normals())
         return depth.max(axis=1, initial=0.0)
