@@ -479,13 +479,13 @@ class Solver:
         start: Array = np.divide(chosen, equations.length)
         attempts: list[Attempt] = []
         equations.overload = None
-        for method, solve in self._chain(start, fallback=fallback, balance=balance):
+        for method, solve, failure in self._chain(start, fallback=fallback, balance=balance):
             equations.solution.array[:] = start
             equations.watch.start()
             if stiffness_changed:
                 equations.h0_is_made = False
             iterations, reason = solve()
-            attempts.append(Attempt(method, iterations, self._outcome(reason)))
+            attempts.append(Attempt(method, iterations, self._outcome(reason, failure)))
             if reason > 0:
                 break
             if self._comm.rank == 0:
@@ -504,15 +504,18 @@ class Solver:
 
     def _chain(
         self, start: Array, *, fallback: bool, balance: bool
-    ) -> Iterator[tuple[str, Callable[[], tuple[int, int]]]]:
+    ) -> Iterator[tuple[str, Callable[[], tuple[int, int]], str]]:
         """The method, and after it the diagnosis and the fallbacks, each if it suits. Collective.
+
+        Yields:
+            Name, what solves, and what its failure tells; empty: what SNES says.
 
         Raises:
             ValueError: Contact cannot balance the load on a nonlinear body (`LoadBalance.check`),
                 which may change as the body deforms: it is checked after a failure alone.
         """
         equations, linear_bulk = self.equations, self._full.bulk.linear
-        yield self.method, self.methods.get(self.method, self.main).solve
+        yield self.method, self.methods.get(self.method, self.main).solve, ""
         if not fallback:
             return
         if balance and not linear_bulk:
@@ -527,17 +530,19 @@ class Solver:
         diagnosis = self.methods[_DIAGNOSIS]
         assert isinstance(diagnosis, Alternation)
         if linear_bulk and diagnosis.suits and self.method != _DIAGNOSIS:
-            yield _DIAGNOSIS, diagnosis.diagnose
+            yield _DIAGNOSIS, diagnosis.diagnose, "no overload found"
         for name in _FALLBACKS:
             if name != self.method and self.methods[name].suits:
-                yield name, self.methods[name].solve
+                yield name, self.methods[name].solve, ""
 
-    def _outcome(self, reason: int) -> str:
+    def _outcome(self, reason: int, failure: str) -> str:
         """What became of an attempt, in words. Collective."""
         if reason > 0:
             return "converged"
         if (overload := self.equations.overload) is not None:
             return overload.in_words()
+        if failure:
+            return failure
         words = _OUTCOMES.get(reason, f"SNES reason {reason}")
         return "; ".join(filter(None, (words, self.equations.watch.chattering())))
 
