@@ -23,8 +23,7 @@ class ActiveSetMonitor:
     """Looks at the status of all points from iteration to iteration.
 
     Attributes:
-        idle: Looks at which the residual had not fallen, neither below its least nor below that at
-            the look before, since it was at its least.
+        idle: Looks since the residual was at its least, without those of its present fall.
         tractions: Of every contact at the first look, (n_points, gdim) (stress).
     """
 
@@ -32,7 +31,8 @@ class ActiveSetMonitor:
         """Take the contacts to look at."""
         self._contacts = contacts
         n = sum(c.quadrature.n_points for c in contacts)
-        self.idle, self._best, self._last = 0, np.inf, np.inf
+        self.idle = self._since = 0  # the latter with them
+        self._best = self._last = np.inf
         self.tractions: list[Array] = []
         self._status = np.full(n, -1, dtype=np.int8)
         self._changes = np.zeros(n, dtype=np.int64)
@@ -40,7 +40,8 @@ class ActiveSetMonitor:
 
     def start(self) -> None:
         """Forget what was seen."""
-        self.idle, self._best, self._last, self.tractions = 0, np.inf, np.inf, []
+        self.idle, self._since, self.tractions = 0, 0, []
+        self._best = self._last = np.inf
         self._status[:], self._changes[:], self._seen[:] = -1, 0, False
 
     def note(self, residual: float) -> None:
@@ -56,10 +57,12 @@ class ActiveSetMonitor:
         status = np.concatenate([c.status for c in self._contacts])
         seen = status == np.arange(len(Status))[:, None]
         if residual < _FALL * self._best:
-            self._best, self.idle = residual, 0
+            self._best, self.idle, self._since = residual, 0, 0
             self._changes[:], self._seen = 0, seen
         else:
-            self.idle += int(not residual < _FALL * self._last)
+            self._since += 1
+            if not residual < _FALL * self._last:
+                self.idle = self._since
             self._changes += status != self._status
             self._seen |= seen
         self._status, self._last = status, residual

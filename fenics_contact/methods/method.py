@@ -26,9 +26,9 @@ __all__ = ["Method", "Newton", "OwnMethod", "SnesMethod", "Tools"]
 _DECREASE = 0.1
 # Share of a step from which on it is the whole one, and no half: multigrid has it to a hundredth.
 _WHOLE = 0.9
-# Iterations in which the residual does not fall, see `ActiveSetMonitor.idle`, after which another
-# method takes over: half of all in a cycle between two states.
-_PATIENCE = 7
+# Iterations without a lower residual, see `ActiveSetMonitor.idle`, after which another method takes
+# over.
+_PATIENCE = 14
 
 _REASONS = PETSc.SNES.ConvergedReason
 
@@ -105,9 +105,8 @@ class OwnMethod(Method):
     `solve` starts from ``equations.solution`` and leaves there what it has found, with the data of
     the contacts as they were; it has converged where ``equations.solved()`` after an
     ``equations.residual``. Newton's method of `Tools.newton` does both: `Newton.attach` it before
-    every solution, and return what its ``solve`` returns. It gives up after 7 iterations in which
-    the residual did not fall (`ActiveSetMonitor.idle`), so that the methods that follow get their
-    turn.
+    every solution, and return what its ``solve`` returns. It gives up after 14 iterations without
+    a lower residual (`ActiveSetMonitor.idle`), so that the methods that follow get their turn.
 
     Attributes:
         by_newton: Whether Newton's method found the last solution, so that the consistent tangent

@@ -89,8 +89,8 @@ METHODS: dict[str, type[Method]] = {
 # What takes over where a method fails: the first is for the stiffest friction, in few iterations,
 # the second for all else.
 _FALLBACKS = ("primal_dual", "continuation")
-# What tells whether friction can bear the load, after the first failure. Behind the others it
-# solved none of 420 random scenes.
+# What tells whether friction can bear the load, after the first failure, if by the pressures at the
+# start or at the end it cannot. Behind the others it solved none of 420 random scenes.
 _DIAGNOSIS = "alternating"
 
 
@@ -514,26 +514,33 @@ class Solver:
             ValueError: Contact cannot balance the load on a nonlinear body (`LoadBalance.check`),
                 which may change as the body deforms: it is checked after a failure alone.
         """
-        equations, linear_bulk = self.equations, self._full.bulk.linear
+        equations = self.equations
         yield self.method, self.methods.get(self.method, self.main).solve, ""
         if not fallback:
             return
-        if balance and not linear_bulk:
-            x = equations.solution.copy()
-            x.array[:] = start
-            equations.set_state(x)
-            x.destroy()
-            self._full.evaluate()
+        failed: Array = equations.solution.array.copy()
+        if balance and not self._full.bulk.linear:
+            self._evaluate(start)
             LoadBalance(equations.motions).check(self._full.load, self._full.operators)
         if not self.may_go_on():
             return
         diagnosis = self.methods[_DIAGNOSIS]
         assert isinstance(diagnosis, Alternation)
-        if linear_bulk and diagnosis.suits and self.method != _DIAGNOSIS:
-            yield _DIAGNOSIS, diagnosis.diagnose, "no overload found"
+        if diagnosis.suits and self.method != _DIAGNOSIS:
+            for state in (start, failed):
+                self._evaluate(state)
+                if equations.find_overload() is not None:
+                    yield _DIAGNOSIS, diagnosis.diagnose, "no overload found"
+                    break
         for name in _FALLBACKS:
             if name != self.method and self.methods[name].suits:
                 yield name, self.methods[name].solve, ""
+
+    def _evaluate(self, state: Array) -> None:
+        """Evaluate all contacts at a dimensionless state. Collective."""
+        self.equations.solution.array[:] = state
+        self.equations.set_state(self.equations.solution)
+        self._full.evaluate()
 
     def _outcome(self, reason: int, failure: str) -> str:
         """What became of an attempt, in words. Collective."""
