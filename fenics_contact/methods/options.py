@@ -1,4 +1,8 @@
-"""PETSc options: the command line's, and those that hold where nobody says anything."""
+"""PETSc options: the command line's, and those that hold where nobody says anything.
+
+petsctools has the like; it takes the command line only where it initialises PETSc itself, which
+DOLFINx has done when a problem is made.
+"""
 
 from __future__ import annotations
 

@@ -2,7 +2,8 @@
 
 A grid is an XML file of unstructured cells (``.vtu``), its arrays in base64; a series is a list of
 such files with their times (``.pvd``). Cells share no nodes, so that fields may jump between them.
-On the calling rank only.
+On the calling rank only. DOLFINx's writers take functions on a mesh, and here are values at
+quadrature points and on facets.
 """
 
 from __future__ import annotations
