@@ -336,8 +336,8 @@ def test_a_block_in_a_corner(
     """A block on a floor with friction, pressed against a wall, by loads that rise and fall.
 
     What the wall bears at the edge that both share changes what the floor bears there: accelerated
-    each by itself, the augmentations of all four fail. Both bear the loads, by statics. The
-    displacements are those of the penalty at 1e4 E/h to 2 % of the largest, for cells of a half to
+    each by itself, the augmentations of all four fail. Both bear the loads, by statics; stiff
+    springs to the round-off of their forces. The displacements are those of the penalty at 1e4 E/h to 2 % of the largest, for cells of a half to
     a third of the block: which of both holds their common edge is not unique.
     """
     displacements = []
@@ -357,7 +357,7 @@ def test_a_block_in_a_corner(
             problem.solve()
             problem.commit()
             force = sum(contact.resultants().force for contact in (floor, wall))
-            assert close(force[[0, 2]], [-side, -up], 1e-8)
+            assert close(force[[0, 2]], [-side, -up], 1e-8 if given else 1e-7)
         displacements.append(nodal(scene.u))
     assert close(*displacements, 0.02)
 
