@@ -77,8 +77,8 @@ class ContactProblem:
             method with a line search on the energy. It is not for mixed functions, whose solutions
             are saddle points. By default "newton"; for a linear bulk on all unknowns
             "lbfgs" by multigrid, and in three dimensions if no bodies slide on each other with
-            finite kinematics. After a failure, unless friction cannot bear the load, "primal_dual"
-            follows where it applies, and "continuation".
+            finite kinematics. After a failure "primal_dual" follows where it applies,
+            "continuation", and "alternating" where that applies.
         alpha: Factor α of the normal contact stiffness in H₀, 0 to 1 (source paper: 1).
         phi: Factor φ of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
             source paper has 0; with 1 a third of the iterations suffices once points stick.

@@ -337,8 +337,9 @@ def test_a_block_in_a_corner(
 
     What the wall bears at the edge that both share changes what the floor bears there: accelerated
     each by itself, the augmentations of all four fail. Both bear the loads, by statics; stiff
-    springs to the round-off of their forces. The displacements are those of the penalty at 1e4 E/h to 2 % of the largest, for cells of a half to
-    a third of the block: which of both holds their common edge is not unique.
+    springs to the round-off of their forces. The displacements are those of the penalty at 1e4 E/h
+    to 2 % of the largest, for cells of a half to a third of the block: which of both holds their
+    common edge is not unique.
     """
     displacements = []
     for given in (AUGMENTED, {}):

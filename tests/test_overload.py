@@ -9,11 +9,11 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.methods.limit_analysis import find_overload
-from scenes.blocks import TOP, block
+from scenes.blocks import LEFT, RIGHT, TOP, block
 from scenes.comparing import raised_everywhere
 from scenes.elasticity import hold
 from scenes.rubber import rubber
-from scenes.tags import sides
+from scenes.tags import plane, sides
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 
@@ -269,6 +269,55 @@ def test_blocks_on_both_sides_do_not_hide_an_overload():
         with pytest.raises(fc.NotConverged, match=r"of body 2, .* the load is") as failed:
             problem.solve()
         assert failed.value.iterations < 1800
+
+
+def groove(angle, n):
+    """A wedge in a V groove, its sides at an angle from the vertical; loads down and along it."""
+    mesh = dolfinx.mesh.create_box(
+        MPI.COMM_WORLD, [(-0.5, 0.0, 0.0), (0.5, 1.0, 1.0)], n, dolfinx.mesh.CellType.hexahedron
+    )
+    tags = sides(mesh, {LEFT: plane(0, -0.5), RIGHT: plane(0, 0.5)})
+    x = mesh.geometry.x
+    x[:, 0] *= 2 * (0.3 + x[:, 2] * np.tan(angle))
+    u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (3,))), name="u")
+    load, v = fem.Constant(mesh, np.zeros(3)), ufl.TestFunction(u.function_space)
+    F = fc.elasticity.LinearElastic(u, 1000.0, nu=0.3, kind="3D").residual(v)
+    F -= ufl.dot(load, v) * ufl.dx
+    normal = np.cos(angle), np.sin(angle)
+    contacts = [
+        fc.Contact(
+            u,
+            fc.ContactSurface(mesh, tags, tag),
+            fc.HalfSpace((side * 0.3, 0.0, 0.0), (-side * normal[0], 0.0, normal[1])),
+            fc.Coulomb(0.5),
+            name=f"side {tag}",
+        )
+        for tag, side in ((LEFT, -1), (RIGHT, 1))
+    ]
+    problem = fc.ContactProblem(F, u, contacts=contacts, small_displacement_tolerance=np.inf)
+    volume = 0.6 + np.tan(angle)
+    return problem, contacts, load, volume
+
+
+@pytest.mark.parametrize(("n", "share", "before"), [((1, 2, 1), 0.9, 0.0), ((2, 2, 2), 0.8, 100.0)])
+def test_a_wedge_in_a_groove_is_none(n, share, before):
+    """Both sides press with N = P/(2 sin α), so that 2 μ N is borne along the groove.
+
+    With more friction than there is, friction bears a part of P, too, and the sides press less: by
+    those pressures both are overloads. The first is pressed and pushed at once, the second pressed
+    by a hundred times as much before.
+    """
+    angle, down = np.radians(10.0), 10.0
+    problem, contacts, load, volume = groove(angle, n)
+    if before:
+        load.value[2] = -before * down / volume
+        problem.solve()
+        problem.commit()
+    along = share * 0.5 * down / np.sin(angle)
+    load.value[:] = 0.0, along / volume, -down / volume
+    problem.solve()
+    force = sum(contact.resultants().force for contact in contacts)
+    assert force == pytest.approx([0.0, -along, down], rel=1e-7, abs=1e-7 * down)
 
 
 def test_the_larger_friction_of_two():

@@ -82,16 +82,6 @@ class Alternation(OwnMethod):
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`. Iterations are Newton's, in all."""
-        return self._iterate()
-
-    def diagnose(self) -> tuple[int, int]:
-        """Find an `Equations.overload`, if there is one: with pressures of an equilibrium.
-
-        Collective. It ends where the load needs no more friction than a cycle has found.
-        """
-        return self._iterate(diagnosis=True)
-
-    def _iterate(self, *, diagnosis: bool = False) -> tuple[int, int]:
         equations = self._equations
         if not self.suits:
             return 0, int(_REASONS.DIVERGED_LINE_SEARCH)
@@ -107,8 +97,6 @@ class Alternation(OwnMethod):
                 overload = equations.find_overload()
                 needed = overload.factor if overload else 1.0
                 overloads = overloads + 1 if 1.0 < needed < np.inf else 0
-                if diagnosis and cycle and not overloads:
-                    return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
                 # Limits that the pressure does not set are what they are.
                 enough = 1 if equations.has_potential else 2 if needed > CLEARLY else _OVERLOADS
                 if overloads >= enough:

@@ -87,11 +87,10 @@ METHODS: dict[str, type[Method]] = {
     "continuation": Continuation,
 }
 # What takes over where a method fails: the first is for the stiffest friction, in few iterations,
-# the second for all else.
-_FALLBACKS = ("primal_dual", "continuation")
-# What tells whether friction can bear the load, after the first failure, if by the pressures at the
-# start or at the end it cannot. Behind the others it solved none of 420 random scenes.
-_DIAGNOSIS = "alternating"
+# the second for all else. The third solved none of 420 random scenes behind the others, but wedges
+# that are let go, and it finds overloads that no start shows: of a tight fit in the first round of
+# multipliers, whose springs are soft.
+_FALLBACKS = ("primal_dual", "continuation", "alternating")
 
 
 @dataclass(frozen=True)
@@ -479,19 +478,17 @@ class Solver:
         start: Array = np.divide(chosen, equations.length)
         attempts: list[Attempt] = []
         equations.overload = None
-        for method, solve, failure in self._chain(start, fallback=fallback, balance=balance):
+        for method in self._chain(start, fallback=fallback, balance=balance):
             equations.solution.array[:] = start
             equations.watch.start()
             if stiffness_changed:
                 equations.h0_is_made = False
-            iterations, reason = solve()
-            attempts.append(Attempt(method, iterations, self._outcome(reason, failure)))
+            iterations, reason = self.methods.get(method, self.main).solve()
+            attempts.append(Attempt(method, iterations, self._outcome(reason)))
             if reason > 0:
                 break
             if self._comm.rank == 0:
                 logger.info("%s", attempts[-1])
-            if equations.overload is not None:
-                break
         equations.set_state(equations.solution)
         own = self.methods.get(method)
         newton = (self._factors if own is None else own.by_newton) and not self._quasi_newton
@@ -502,54 +499,29 @@ class Solver:
             self.starts.keep(predict=own is None or not self._full.bulk.linear)
         return int(reason), attempts
 
-    def _chain(
-        self, start: Array, *, fallback: bool, balance: bool
-    ) -> Iterator[tuple[str, Callable[[], tuple[int, int]], str]]:
-        """The method, and after it the diagnosis and the fallbacks, each if it suits. Collective.
-
-        Yields:
-            Name, what solves, and what its failure tells; empty: what SNES says.
+    def _chain(self, start: Array, *, fallback: bool, balance: bool) -> Iterator[str]:
+        """The method, and those that follow while none converges. Collective.
 
         Raises:
             ValueError: Contact cannot balance the load on a nonlinear body (`LoadBalance.check`),
                 which may change as the body deforms: it is checked after a failure alone.
         """
-        equations = self.equations
-        yield self.method, self.methods.get(self.method, self.main).solve, ""
-        if not fallback:
-            return
-        failed: Array = equations.solution.array.copy()
-        if balance and not self._full.bulk.linear:
-            self._evaluate(start)
-            LoadBalance(equations.motions).check(self._full.load, self._full.operators)
-        if not self.may_go_on():
-            return
-        diagnosis = self.methods[_DIAGNOSIS]
-        assert isinstance(diagnosis, Alternation)
-        if diagnosis.suits and self.method != _DIAGNOSIS:
-            for state in (start, failed):
-                self._evaluate(state)
-                if equations.find_overload() is not None:
-                    yield _DIAGNOSIS, diagnosis.diagnose, "no overload found"
-                    break
-        for name in _FALLBACKS:
-            if name != self.method and self.methods[name].suits:
-                yield name, self.methods[name].solve, ""
+        yield self.method
+        if fallback and balance and not self._full.bulk.linear:
+            self.equations.solution.array[:] = start
+            self.equations.set_state(self.equations.solution)
+            self._full.evaluate()
+            LoadBalance(self.equations.motions).check(self._full.load, self._full.operators)
+        if fallback and self.may_go_on():
+            others = (name for name in _FALLBACKS if name != self.method)
+            yield from (name for name in others if self.methods[name].suits)
 
-    def _evaluate(self, state: Array) -> None:
-        """Evaluate all contacts at a dimensionless state. Collective."""
-        self.equations.solution.array[:] = state
-        self.equations.set_state(self.equations.solution)
-        self._full.evaluate()
-
-    def _outcome(self, reason: int, failure: str) -> str:
+    def _outcome(self, reason: int) -> str:
         """What became of an attempt, in words. Collective."""
         if reason > 0:
             return "converged"
         if (overload := self.equations.overload) is not None:
             return overload.in_words()
-        if failure:
-            return failure
         words = _OUTCOMES.get(reason, f"SNES reason {reason}")
         return "; ".join(filter(None, (words, self.equations.watch.chattering())))
 
