@@ -110,7 +110,8 @@ class RigidMotions:
         """
         motions, n = self.of_bodies if of_bodies is None else of_bodies, self._n_bodies
         products = [system.part(motion) * values for motion in motions]
-        return np.stack([np.bincount(system.label, p, minlength=n)[:n] for p in products], axis=1)
+        found = [np.bincount(system.label, p, minlength=n)[:n] for p in products]
+        return np.stack(found, axis=1).astype(np.float64)  # of none NumPy counts integers
 
     def _sums(self, values: Array, of_bodies: Array | None = None) -> Array:
         """Sums of values at this rank's unknowns times all motions, (n_motions,)."""
