@@ -508,8 +508,10 @@ class Solver:
         """
         yield self.method
         if fallback and balance and not self._full.bulk.linear:
-            self.equations.solution.array[:] = start
-            self.equations.set_state(self.equations.solution)
+            x = self.equations.solution.copy()  # which is judged if nothing follows
+            x.array[:] = start
+            self.equations.set_state(x)
+            x.destroy()
             self._full.evaluate()
             LoadBalance(self.equations.motions).check(self._full.load, self._full.operators)
         if fallback and self.may_go_on():
