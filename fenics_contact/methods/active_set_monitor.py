@@ -31,7 +31,7 @@ class ActiveSetMonitor:
         """Take the contacts to look at."""
         self._contacts = contacts
         n = sum(c.quadrature.n_points for c in contacts)
-        self.idle = self._since = 0  # the latter with them
+        self.idle = self._since = 0  # the latter with those of its present fall
         self._best = self._last = np.inf
         self.tractions: list[Array] = []
         self._status = np.full(n, -1, dtype=np.int8)

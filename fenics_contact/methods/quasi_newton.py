@@ -101,8 +101,8 @@ class QuasiNewton(SnesMethod):
                 return iterations, failure
             if not self._refresh():
                 return iterations, compat.NOT_FINITE
-            overloaded = stalls >= _FEW_STALLS and equations.find_overload() is not None
-            if overloaded and self.gives_up():
+            may_hand_over = stalls >= _FEW_STALLS and self.gives_up()
+            if may_hand_over and equations.find_overload() is not None:
                 return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
 
     def _start(self, *, idle: bool) -> None:

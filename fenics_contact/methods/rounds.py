@@ -64,8 +64,8 @@ def solve_in_rounds(
             start = equations.system.state()
             reason, tried = iterate(number == 1)
             _append(attempts, tried)
-            overloaded = equations.overload is not None
-            if reason <= 0 and not overloaded:
+            overload = equations.overload
+            if reason <= 0 and overload is None:
                 break
             for operator in equations.full.operators:
                 if operator.contact in augmented:
@@ -79,19 +79,19 @@ def solve_in_rounds(
             # Given displacements squeeze a body the less the softer the springs are, and there is
             # less friction: an overload is none before the multipliers bear what springs cannot.
             # Soft ones take over no more in a round than their stiffness by the bulk's of the rest.
-            share = min(1.0, equations.hardness()) if overloaded else 1.0
-            if equations.overload is not None:
+            share = min(1.0, equations.hardness()) if overload else 1.0
+            if overload is not None:
                 grows = max(errors) / share
-                if grows < _SURELY * (equations.overload.factor - 1.0) < np.inf:
+                if grows < _SURELY * (overload.factor - 1.0) < np.inf:
                     break
-            if worst <= share and (exact or overloaded):
+            if worst <= share and (exact or overload):
                 break
             exact = worst <= _NEARLY
             left = min((e for e in errors if e > 0), default=0.0)
             equations.round_rtol = 0.0 if exact else min(_FIRST_ROUND, INNER * left)
             if number < _MAX_ROUNDS and worst > share:
                 acceleration.augment()
-                if overloaded:  # what the load moved may be too far away to come back
+                if overload:  # what the load moved may be too far away to come back
                     equations.system.set_state(start)
     finally:
         equations.round_rtol = 0.0
