@@ -112,6 +112,19 @@ def test_methods_are_tried_on_a_refused_scene(monkeypatch):
 
 
 @serial
+def test_an_iteration_without_progress_is_no_solution():
+    """Where it stops nearly a hundredth of the forces is not in balance."""
+    name = "a factorisation that failed, followed by another"
+    scene = next(e["scene"] for e in SCENES["regressions"] if e["name"] == name)
+    outcome = solve(scene | {"method": "newton"})
+    assert outcome.outcome == "refused"
+    assert "Tried: newton: no progress (" in outcome.detail[0]
+    outcome = solve(scene)
+    assert outcome.outcome == "refused"
+    assert "converged (" not in outcome.detail[0]
+
+
+@serial
 @pytest.mark.parametrize("method", [None, "newton", "lbfgs", "continuation"])
 def test_no_method_refuses_what_others_solve(method):
     """By default it was refused as an overload, before the methods that solve it were tried."""

@@ -1,5 +1,7 @@
 """Shares and places as messages say them."""
 
+import ast
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from fenics_contact.wording import percent, place_in_words
 def test_a_place_has_six_digits_in_any_unit(unit):
     """The numbers that are said, read back: half of the sixth digit of the largest, at most."""
     place = unit * np.array([1.2345678, -0.4567891, 1e-12])
-    said = np.array(eval(place_in_words(place)))
+    said = np.array(ast.literal_eval(place_in_words(place)))
     assert np.abs(said - place).max() <= 0.5e-5 * unit
     assert said[2] == 0.0 and np.all(said[:2] != 0.0)
 
