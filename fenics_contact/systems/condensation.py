@@ -99,20 +99,23 @@ class Condensation:
         self._stiffness.mult(self._right, self._left)
         return self._left.array_r.copy()
 
-    def _solve(self, force: Array) -> Array:
-        """Displacement of the unknowns eliminated under a force on them; zero at the others."""
-        own = self._piece
+    def _solve(self, force: Array, kept: Array) -> Array:
+        """All unknowns under a force on those eliminated, (n_local,), zero if held. Collective.
+
+        Args:
+            force: At this rank's unknowns, (n_local,) (force).
+            kept: Displacement of the unknowns kept, (n_kept,) on the first rank.
+        """
+        own, result = self._piece, np.zeros_like(force)
         applied = np.zeros(own.size)
         applied[own.inner] = force[own.unknowns[own.inner]]
         partial = self._dissection.push(applied)
-        boundary: Array = np.zeros(own.boundary.size)
-        result = np.zeros_like(force)
-        if self._interface.any:
-            boundary, result[own.interface] = self._interface.at_rest(
-                partial.pushed[own.boundary], force[own.interface]
-            )
+        boundary, result[own.interface] = self._interface.solve(
+            partial.pushed[own.boundary], force[own.interface], kept
+        )
         state = self._dissection.complete(boundary, partial)
         result[own.unknowns[own.inner]] = state[own.inner]
+        result[self._unknowns.kept] = self._unknowns.scattered(kept)
         return result
 
     def set_load(self, force: Array, state: Array) -> None:
@@ -167,14 +170,15 @@ class Condensation:
         prescribed: Array = np.zeros_like(force)
         prescribed[self._held] = values / self._scale
         lift = self._product(prescribed) if has_values else np.zeros_like(force)
-        field = prescribed + self._solve(force - lift)
+        at_rest = np.zeros(self._unknowns.n_local)
+        field = prescribed + self._solve(force - lift, at_rest)
         image = self._product(field)
         kept = self._unknowns.kept
         load = self._unknowns.gathered((force - image)[kept])
         # Apart: the share of the prescribed values in the condensed load.
         by_values = np.zeros_like(load)
         if has_values:
-            still = field if not has_force else prescribed - self._solve(lift)
+            still = field if not has_force else prescribed - self._solve(lift, at_rest)
             by_values = -self._unknowns.gathered(self._product(still)[kept])
         at_field = force.copy()
         at_field[self._held] = image[self._held]
@@ -191,12 +195,7 @@ class Condensation:
         Args:
             kept: On the first rank, (n_kept,).
         """
-        own, result = self._piece, np.zeros(self._right.getLocalSize())
-        boundary, result[own.interface] = self._interface.carried(kept)
-        state = self._dissection.complete(boundary)
-        result[own.unknowns[own.inner]] = state[own.inner]
-        result[self._unknowns.kept] = self._unknowns.scattered(kept)
-        return result
+        return self._solve(np.zeros(self._right.getLocalSize()), kept)
 
 
 @dataclass(frozen=True)
@@ -297,11 +296,7 @@ def _over_ranks(space: fem.FunctionSpace, marks: Mask, *, add: bool = False) -> 
 
 
 class _Interface:
-    """What the first rank makes of the pieces: sums at the unknowns kept and at the interface.
-
-    Attributes:
-        any: Whether pieces meet anywhere.
-    """
+    """What the first rank makes of the pieces: sums at the unknowns kept and at the interface."""
 
     def __init__(self, piece: _Piece, unknowns: Selection) -> None:
         """Number. Collective."""
@@ -309,7 +304,6 @@ class _Interface:
         shares = self._comm.allgather(unknowns.whole.first + piece.interface.astype(np.int64))
         self._counts = [share.size for share in shares]
         between = np.concatenate(shares)
-        self.any = bool(between.size)
         self._n_between = int(between.size)
         self._size = self._n_between + unknowns.n_global
         place = np.searchsorted(between, piece.numbers)
@@ -333,7 +327,7 @@ class _Interface:
         else:
             self._comm.Send(schur.T, 0)
         with collective_errors(self._comm):
-            if self._comm.rank == 0 and self.any:
+            if self._comm.rank == 0 and self._n_between:
                 self._between = Eliminated(total, self._n_between, symmetric=symmetric)
                 return self._between.release()
         return total
@@ -351,39 +345,27 @@ class _Interface:
             total.T[np.ix_(place, place)] += part.T
         return total
 
-    def at_rest(self, pushed: Array, force: Array) -> tuple[Array, Array]:
-        """Displacement of boundary and interface with the unknowns kept at rest. Collective.
+    def solve(self, pushed: Array, force: Array, kept: Array) -> tuple[Array, Array]:
+        """Displacement of boundary and interface. Collective.
 
         Args:
             pushed: What the inner unknowns do to the boundary of this piece, (n_boundary,).
             force: What acts at this rank's part of the interface.
+            kept: Displacement of the unknowns kept, (n_kept,) on the first rank.
 
         Returns:
             Of the boundary of this piece, (n_boundary,), and of this rank's part of the interface.
         """
         parts, applied = self._comm.gather(pushed), np.zeros(self._n_between)
         self._comm.Gatherv(force, (applied, self._counts))
-        state: Array = np.zeros(self._size)
+        n, state = self._n_between, np.zeros(self._size)
         if parts is not None:
-            total: Array = np.zeros(self._size)
-            for place, part in zip(self._places, parts, strict=True):
-                total[place] += part
-            n = self._n_between
-            if self._between is not None:
-                state[:n] = self._between.at_rest(applied + total[:n])
-        return self._spread(state)
-
-    def carried(self, kept: Array) -> tuple[Array, Array]:
-        """The same as `at_rest` without load, for the unknowns kept, (n_kept,) on the first rank.
-
-        Collective.
-        """
-        state: Array = np.zeros(self._size)
-        if self._comm.rank == 0:
-            n = self._n_between
             state[n:] = kept
             if self._between is not None:
-                state[:n] = self._between.carried(kept)
+                total = np.append(applied, np.zeros_like(kept))
+                for place, part in zip(self._places, parts, strict=True):
+                    total[place] += part
+                state[:n] = self._between.at_rest(total[:n]) + self._between.carried(kept)
         return self._spread(state)
 
     def _spread(self, state: Array) -> tuple[Array, Array]:

@@ -28,11 +28,11 @@ _INNER = 6000
 
 @dataclass(frozen=True)
 class Partial:
-    """What forces make of a piece whose boundary is at rest, as far as the leaves and upwards.
+    """What forces make of a piece whose boundary is at rest.
 
     Attributes:
-        inner: Displacement of the unknowns inside of the substructures, zero at others, (n,).
-        pushed: Forces that are left at the others, as they were when these were eliminated, (n,).
+        inner: Displacement of every unknown with those eliminated after it at rest, (n,).
+        pushed: Forces at the unknowns, as they were when these were eliminated, (n,).
     """
 
     inner: Array
@@ -101,11 +101,9 @@ class Eliminated:
             return np.zeros_like(force)
         return np.asarray(scipy.linalg.lu_solve(self._factors, force, check_finite=False))
 
-    def pushed(self, force: Array) -> Array:
-        """Forces that these on those eliminated leave at the others."""
-        if self._lower is not None:
-            return np.asarray(-(self._felt @ self._half_solved(force)))
-        return np.asarray(-(self._felt @ self.at_rest(force)))
+    def reaction(self, state: Array) -> Array:
+        """Force that the others at rest feel for displacements of those eliminated."""
+        return np.asarray(self._felt @ (state if self._lower is None else self._lower.T @ state))
 
     def carried(self, others: Array) -> Array:
         """Displacement of those eliminated that the others' brings along."""
@@ -115,33 +113,18 @@ class Eliminated:
 
 
 @dataclass(frozen=True)
-class _Leaf:
-    """A substructure.
+class _Step:
+    """Some unknowns eliminated: those inside of a substructure, or where two parts meet.
 
     Attributes:
-        unknowns: Numbers of its unknowns in the piece, in its own order.
-        boundary: Of those that stay.
-        made: The substructure.
-    """
-
-    unknowns: Index
-    boundary: Index
-    made: Substructure
-
-
-@dataclass(frozen=True)
-class _Node:
-    """Where two parts meet.
-
-    Attributes:
-        eliminated: Numbers in the piece of the unknowns that are eliminated there.
-        others: Of those around them.
+        eliminated: Their numbers in the piece.
+        others: Numbers of those around them, which are not eliminated yet.
         made: The elimination.
     """
 
     eliminated: Index
     others: Index
-    made: Eliminated
+    made: Substructure | Eliminated
 
 
 class Dissection:
@@ -178,14 +161,14 @@ class Dissection:
         """
         n, self.boundary = stiffness.getSize()[0], boundary
         self._n, self._symmetric, self._prefix = n, symmetric, prefix
-        self._leaves: list[_Leaf] = []
-        self._nodes: list[_Node] = []  # children before parents
+        self._steps: list[_Step] = []  # substructures first, children before parents
         # In the plane one piece takes no more than a plain factorisation.
         parts = (n - boundary.size) / inner if places.shape[1] == 3 else 1.0
         depth = round(np.log2(max(parts, 1.0)))
         if depth == 0:
             whole = Substructure(stiffness, boundary, symmetric=symmetric, prefix=prefix)
-            self._leaves = [_Leaf(np.arange(n), boundary, whole)]
+            inside = np.setdiff1d(np.arange(n), boundary, assume_unique=True)
+            self._steps = [_Step(inside, boundary, whole)]
             self.schur: Array = whole.release()
             return
         pointers, columns, values = stiffness.getValuesCSR()
@@ -249,7 +232,7 @@ class Dissection:
             symmetric=self._symmetric,
             prefix=self._prefix,
         )
-        self._leaves.append(_Leaf(unknowns, around, made))
+        self._steps.append(_Step(inner, around, made))
         return around, made.release()
 
     def _add_node(
@@ -282,7 +265,7 @@ class Dissection:
         back = matrix[others][:, eliminated].tocoo()
         total[n + back.row, back.col] += back.data
         made = Eliminated(total, n, symmetric=self._symmetric)
-        self._nodes.append(_Node(eliminated, others, made))
+        self._steps.append(_Step(eliminated, others, made))
         return others, made.release()
 
     def release(self) -> Array:
@@ -292,35 +275,28 @@ class Dissection:
 
     def push(self, force: Array) -> Partial:
         """What forces on all but the boundary, (n,), do with the boundary at rest."""
-        inner, pushed = np.zeros(self._n), force.copy()
-        for leaf in self._leaves:
-            state = leaf.made.at_rest(force[leaf.unknowns])
-            if state.any():
-                inner[leaf.unknowns] += state
-                pushed[leaf.boundary] -= leaf.made.reaction(state)
-        for node in self._nodes:
-            pushed[node.others] += node.made.pushed(pushed[node.eliminated])
-        return Partial(inner, pushed)
+        found = Partial(np.zeros(self._n), force.copy())
+        for step in self._steps:
+            mine = found.pushed[step.eliminated]
+            if mine.any():
+                found.inner[step.eliminated] = state = step.made.at_rest(mine)
+                found.pushed[step.others] -= step.made.reaction(state)
+        return found
 
-    def complete(self, boundary: Array, partial: Partial | None = None) -> Array:
+    def complete(self, boundary: Array, partial: Partial) -> Array:
         """Displacements of all unknowns, (n,).
 
         Args:
             boundary: Those of the boundary, (n_boundary,).
-            partial: What forces have done; None: there are none.
+            partial: What forces have done.
         """
-        state = np.zeros(self._n)
+        state = partial.inner.copy()
         state[self.boundary] = boundary
-        for node in reversed(self._nodes):
-            mine = node.made.carried(state[node.others])
-            if partial is not None:
-                mine += node.made.at_rest(partial.pushed[node.eliminated])
-            state[node.eliminated] = mine
-        for leaf in self._leaves:
-            around = state[leaf.boundary]
-            if around.any():
-                state[leaf.unknowns] = leaf.made.carried(around)
-        return state if partial is None else state + partial.inner
+        for step in reversed(self._steps):
+            others = state[step.others]
+            if others.any():
+                state[step.eliminated] += step.made.carried(others)
+        return state
 
 
 def _dissected(

@@ -100,29 +100,26 @@ class Substructure:
         return schur
 
     def at_rest(self, force: Array) -> Array:
-        """Displacement under forces on the inner unknowns, (n,), with the boundary at rest."""
-        result = np.zeros_like(force)
-        inner = force[self._inner]
-        if inner.any():
-            self._left.array[:] = 0.0
-            self._left.array[self._inner] = inner
-            self._factor.solve(self._left, self._right)
-            result[self._inner] = self._right.array_r[self._inner]
-        return result
+        """Displacement of the inner unknowns under forces on them, with the boundary at rest."""
+        if not self._inner.size:
+            return np.zeros(0)
+        self._left.array[:] = 0.0
+        self._left.array[self._inner] = force
+        self._factor.solve(self._left, self._right)
+        return np.asarray(self._right.array_r[self._inner])
 
     def carried(self, boundary: Array) -> Array:
-        """Displacement that the boundary's, (n_boundary,), brings along, without load, (n,)."""
-        state = np.zeros(self._right.getSize())
-        state[self._boundary] = boundary
-        return state - self.at_rest(self.product(state))
+        """Displacement of the inner unknowns that the boundary's brings along, without load."""
+        return self.at_rest(-self._product(self._boundary, boundary)[self._inner])
 
-    def reaction(self, state: Array) -> Array:
-        """Force at the boundary, (n_boundary,), for displacements, (n,)."""
-        return self.product(state)[self._boundary]
+    def reaction(self, inner: Array) -> Array:
+        """Force that the boundary at rest feels, (n_boundary,), for inner displacements."""
+        return self._product(self._inner, inner)[self._boundary]
 
-    def product(self, state: Array) -> Array:
-        """The stiffness times displacements, (n,)."""
-        self._right.array[:] = state
+    def _product(self, numbers: Indices, values: Array) -> Array:
+        """The stiffness times displacements of some unknowns, (n,)."""
+        self._right.array[:] = 0.0
+        self._right.array[numbers] = values
         self._stiffness.mult(self._right, self._left)
         return self._left.array_r.copy()
 
