@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from fenics_contact.parallel import global_sum
 from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
@@ -22,8 +23,6 @@ __all__ = ["MOST_EXCUSED", "InitialForces", "Labels", "Norms", "Parts", "by_body
 
 Labels = npt.NDArray[np.intp]
 
-# Sums of squares from here on, and up to one over it, have lost none of their terms.
-_SMALL = 1e-200
 # Round-off of a product K u by the size of its terms, summed up row by row. A body that is carried
 # along shows it: up to 14 eps on random tetrahedra of degree 2, 34 on a distorted mesh.
 _ROUND_OFF = 40 * np.finfo(float).eps
@@ -103,43 +102,35 @@ class Norms:
         return _root(self.residual[: self.n_bodies])
 
 
+@dataclass(frozen=True)
 class Parts:
     """How the unknowns of a space are shared by bodies and free obstacles, and what contacts touch.
 
     Attributes:
-        names: Of the parts.
-        n_bodies: Number of bodies and free obstacles.
+        comm: The ranks.
+        label: Body or free obstacle of every unknown of this rank, (n_local,).
+        bodies: Names of bodies, then of free obstacles.
+        contacts: Names of the contacts.
+        touched: Unknowns of this rank that a contact feels or acts on, for every contact.
+        pairs: Bodies and obstacles that a contact presses on each other, for every contact,
+            (n_pairs, 2); a body on a rigid obstacle is paired with itself.
+        scales: Reference scales of the bodies.
+        motions: Of every free obstacle the number of its contact.
     """
 
-    def __init__(
-        self,
-        comm: MPI.Comm,
-        label: Labels,
-        bodies: Sequence[str],
-        contacts: Sequence[str],
-        touched: Sequence[npt.NDArray[np.int32]],
-        pairs: Sequence[Index],
-        scales: ReferenceScales,
-        motions: Sequence[int],
-    ) -> None:
-        """Collect. Collective.
+    comm: MPI.Comm
+    label: Labels
+    bodies: Sequence[str]
+    contacts: Sequence[str]
+    touched: Sequence[npt.NDArray[np.int32]]
+    pairs: Sequence[Index]
+    scales: ReferenceScales
+    motions: Sequence[int]
 
-        Args:
-            comm: The ranks.
-            label: Body or free obstacle of every unknown of this rank, (n_local,).
-            bodies: Names of bodies, then of free obstacles.
-            contacts: Names of the contacts.
-            touched: Unknowns of this rank that a contact feels or acts on, for every contact.
-            pairs: Bodies and obstacles that a contact presses on each other, for every contact,
-                (n_pairs, 2); a body on a rigid obstacle is paired with itself.
-            scales: Reference scales of the bodies.
-            motions: Of every free obstacle the number of its contact.
-        """
-        self._comm, self._touched = comm, touched
-        self.n_bodies = len(bodies)
-        self._bodies: Labels | int = label if len(bodies) > 1 else 0
-        self.names = [*bodies, *contacts]
-        self._motions, self._pairs, self._scales = list(motions), pairs, scales
+    @property
+    def names(self) -> list[str]:
+        """Names of the parts."""
+        return [*self.bodies, *self.contacts]
 
     def norms(
         self,
@@ -162,37 +153,37 @@ class Parts:
             outside: Norms of load and product at unknowns outside of the space, (2, n_bodies).
             start: Forces at the beginning of the increment.
         """
-        n, free = self.n_bodies, np.where(constrained, 0.0, residual)
+        n, free = len(self.bodies), np.where(constrained, 0.0, residual)
         held = residual - free
         total = contacts[0] if len(contacts) == 1 else sum(contacts, np.zeros_like(residual))
-        rows = [(v, self._bodies) for v in (free, held, total, load, product)]
-        for force, touched in zip(contacts, self._touched, strict=True):
-            bodies = 0 if isinstance(self._bodies, int) else self._bodies[touched]
+        rows = [(v, self.label) for v in (free, held, total, load, product)]
+        for force, touched in zip(contacts, self.touched, strict=True):
+            bodies = self.label[touched]
             push = np.where(constrained, 0.0, force)[touched]
             rows += [(free[touched], bodies), (push, bodies)]
-        found = _norms(self._comm, rows, n)
+        found = _norms(self.comm, rows, n)
         left, reaction, contact, loads, terms = found[:5]
         loads, terms = np.hypot(loads, outside[0]), np.hypot(terms, outside[1])
         own, pushes = found[5::2], found[6::2]
-        for body, number in zip(range(n - len(self._motions), n), self._motions, strict=True):
+        for body, number in zip(range(n - len(self.motions), n), self.motions, strict=True):
             # What acts on a free obstacle may cancel; what it is the sum of does not.
             contact[body] = _root(pushes[number])
         force = np.max([loads, reaction, contact], axis=0)
         # A displacement that nothing holds may grow without bounds, and would excuse anything.
-        fixed = self._scales.held
-        of_bodies = np.append(self._scales.force, np.full(len(self._motions), np.inf))
+        fixed = self.scales.held
+        of_bodies = np.append(self.scales.force, np.full(len(self.motions), np.inf))
         farthest = _FARTHEST * np.maximum(of_bodies, start.terms)
         terms = np.maximum(terms, start.terms)
         terms = np.where(fixed, terms, np.minimum(terms, farthest))
         round_off = np.maximum(_ROUND_OFF * terms, _LEAST)
         # A contact force is as exact as the softer of both bodies has it.
         exact = np.tile(round_off, (len(contacts), 1))
-        for row, pairs in zip(exact, self._pairs, strict=True):
+        for row, pairs in zip(exact, self.pairs, strict=True):
             for one, other in (pairs.T, pairs.T[::-1]):
                 np.minimum.at(row, one, round_off[other])
         acts = pushes > np.maximum(exact, ROUND_OFF * force)
         # What a sine leaves of a load at its zeros, and moves no digit where conditions hold all.
-        none = np.append(_ROUND_OFF * self._scales.least_force, np.zeros(len(self._motions)))
+        none = np.append(_ROUND_OFF * self.scales.least_force, np.zeros(len(self.motions)))
         loaded = loads > np.where(fixed, none, 0.0)
         limited = loaded | (acts.any(axis=0) & ~fixed)
         # Contact forces that are unloaded leave their round-off.
@@ -206,7 +197,7 @@ class Parts:
         blurs = np.where(acts & (unloaded <= MOST_EXCUSED * pushes), round_off, 0.0)
         sides = [
             _governing(pairs, *rows)
-            for pairs, *rows in zip(self._pairs, own, pushes, floors, blurs, strict=True)
+            for pairs, *rows in zip(self.pairs, own, pushes, floors, blurs, strict=True)
         ]
         of_contacts = np.reshape(sides, (len(contacts), 4)).T
         acted_on = (loaded | acts.any(axis=0)) & (unloaded <= MOST_EXCUSED * force)
@@ -251,7 +242,7 @@ def by_body(comm: MPI.Comm, vectors: Sequence[Array], label: Labels, n_bodies: i
         label: Body of every unknown, (n_local,).
         n_bodies: Their number.
     """
-    return _norms(comm, [(v, label if n_bodies > 1 else 0) for v in vectors], n_bodies)
+    return _norms(comm, [(v, label) for v in vectors], n_bodies)
 
 
 def _root(values: Array) -> float:
@@ -262,34 +253,19 @@ def _root(values: Array) -> float:
     return largest * float(np.sqrt(np.sum((values / largest) ** 2)))
 
 
-def _norms(comm: MPI.Comm, rows: Sequence[tuple[Array, Labels | int]], n: int) -> Array:
-    """Norms of vectors by label, one for all or of each entry, (n_vectors, n). Collective.
+def _norms(comm: MPI.Comm, rows: Sequence[tuple[Array, Labels]], n: int) -> Array:
+    """Norms of vectors by the label of each entry, (n_vectors, n). Collective.
 
-    Squares neither overflow nor vanish.
+    Squares neither overflow nor vanish. A vector with an entry that is not finite has no norm that
+    is trusted: NaN for all labels.
     """
-    mine = np.zeros((len(rows), n + 1))
-    for found, (values, label) in zip(mine, rows, strict=True):
-        if isinstance(label, int):
-            square = float(values @ values)
-            if _SMALL < square < 1 / _SMALL:
-                found[label], found[n] = square, 1.0
-                continue
-        largest = np.abs(values).max(initial=0.0)
-        found[n] = largest
-        if largest > 0.0 and np.isfinite(largest):
-            scaled = values / largest
-            if isinstance(label, int):
-                found[label] = scaled @ scaled
-            else:
-                found[:n] = np.bincount(label, scaled * scaled, minlength=n)
-    if comm.size > 1:
-        ranks = np.array(comm.allgather(mine))
-    else:
-        ranks = mine[None]
-    largest = ranks[:, :, n].max(axis=0)
-    safe = np.where(largest > 0, largest, 1.0)
-    with np.errstate(invalid="ignore"):
-        share = (ranks[:, :, n] / safe) ** 2
-        norms = largest[:, None] * np.sqrt(np.sum(share[:, :, None] * ranks[:, :, :n], axis=0))
-    # Whose entry was not finite cannot be told from here: none is trusted.
+    largest = np.array([np.abs(values).max(initial=0.0) for values, _ in rows])
+    largest[np.isnan(largest)] = np.inf  # the maximum of MPI has no rule for NaN
+    comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+    size = np.where((largest > 0.0) & np.isfinite(largest), largest, 1.0)
+    squares = np.zeros((len(rows), n))
+    with np.errstate(all="ignore"):
+        for found, (values, label), unit in zip(squares, rows, size, strict=True):
+            found[:] = np.bincount(label, (values / unit) ** 2, minlength=n)
+        norms = size[:, None] * np.sqrt(global_sum(comm, squares))
     return np.where(np.isfinite(largest)[:, None], norms, np.nan)
