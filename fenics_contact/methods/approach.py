@@ -57,22 +57,21 @@ def _feeling(jumps: Array) -> Mask:
     return np.asarray(np.abs(jumps).max(axis=(0, 2), initial=0.0) > NEGLIGIBLE)
 
 
+@dataclass(frozen=True)
 class Approach:
-    """Where bodies without contact come from and go to in an increment."""
+    """Where bodies without contact come from and go to in an increment.
 
-    def __init__(
-        self, full: FullSystem, motions: RigidBodyModes, load: Array, before: Array
-    ) -> None:
-        """Nothing has moved yet.
+    Attributes:
+        full: The system on all unknowns.
+        motions: Rigid motions of the bodies.
+        load: External forces at this rank's unknowns (force).
+        before: The state before Dirichlet conditions took their present values.
+    """
 
-        Args:
-            full: The system on all unknowns.
-            motions: Rigid motions of the bodies.
-            load: External forces at this rank's unknowns (force).
-            before: The state before Dirichlet conditions took their present values.
-        """
-        self._full, self._motions = full, motions
-        self._load, self._before = load, before
+    full: FullSystem
+    motions: RigidBodyModes
+    load: Array
+    before: Array
 
     def lead(self, *, first: bool) -> bool:
         """Set bodies that nothing holds yet down, or move them to first touch. Collective.
@@ -86,21 +85,21 @@ class Approach:
         Returns:
             Whether nothing was borne before.
         """
-        full, motions = self._full, self._motions
+        full, motions = self.full, self.motions
         if not len(motions.free):
             return first
         full.evaluate()
         finite = all(contact.finite for contact in full.contacts)
-        groups, load_size = motions.groups(), motions.generalised_load(self._load)
+        groups, load_size = motions.groups(), motions.generalised_load(self.load)
         borne = full.contact_force_sizes(committed=finite)
         idle = (borne < _IDLE * load_size)[groups] & (not first)
         untouched = self._untouched()
         if first:
             here = full.state()
             with self._obstacles_at_start():
-                self._full.evaluate_at(self._before)
+                full.evaluate_at(self.before)
                 untouched = np.union1d(untouched, self._untouched())
-            self._full.evaluate_at(here)
+            full.evaluate_at(here)
         if len(untouched) < len(motions.free) and motions.turning:
             # Where bodies touch, an obstacle that turns freely follows in the iteration.
             untouched = untouched[motions.of_any_body()[untouched]]
@@ -113,14 +112,13 @@ class Approach:
 
     def _untouched(self) -> Index:
         """Free motions of what no closed point touches, by their numbers. Collective."""
-        contacts, motions = self._full.contacts, self._motions
+        contacts, motions = self.full.contacts, self.motions
         touched: Array = np.zeros(len(motions.free))
-        for contact, jumps in zip(
-            contacts, self._felt(np.arange(len(motions.free)))[1], strict=True
-        ):
+        every = self._felt(np.arange(len(motions.free)))[1]
+        for contact, jumps in zip(contacts, every, strict=True):
             closed = contact.status != Status.OPEN
             touched += (np.abs(jumps[:, closed]) > NEGLIGIBLE).any(axis=(1, 2))
-        touched = global_sum(self._full.unknowns.comm, touched)
+        touched = global_sum(self.full.unknowns.comm, touched)
         # What turns about a point does not move there.
         return np.flatnonzero(~(motions.of_same_body() @ (touched > 0)))
 
@@ -134,20 +132,20 @@ class Approach:
         Args:
             which: Numbers of their free motions.
         """
-        full = self._full
+        full = self.full
         aloft = full.state()
         # An obstacle pressed by a force comes to a body as one that is led there does, and may be
         # led along by then: slip is counted from where its increment starts.
-        of_bodies = which[self._motions.of_any_body()[which]]
+        of_bodies = which[self.motions.of_any_body()[which]]
         if len(of_bodies) and any(contact.law.has_friction for contact in full.contacts):
             along = None
             with self._obstacles_at_start() as motions:
-                self._full.evaluate_at(np.where(full.constrained, self._before, aloft))
+                full.evaluate_at(np.where(full.constrained, self.before, aloft))
                 if self._find_rest_position(which):
                     along = self._fit_obstacle_motion(which, motions)
                     for contact, jumps in zip(full.contacts, self._felt(of_bodies)[1], strict=True):
                         contact.states.count_slip_from_here(_feeling(jumps))
-            self._full.evaluate_at(aloft)
+            full.evaluate_at(aloft)
             if along is not None:
                 self._move(which, along)
         self._find_rest_position(which)
@@ -168,16 +166,16 @@ class Approach:
         """
         gram: Array = np.zeros((len(which), len(which)))
         work: Array = np.zeros(len(which))
-        scales = self._full.scales
+        scales = self.full.scales
         for number, (contact, jumps, motion) in enumerate(
-            zip(self._full.contacts, self._felt(which)[1], obstacles, strict=True)
+            zip(self.full.contacts, self._felt(which)[1], obstacles, strict=True)
         ):
             touches = contact.values.opening <= FLAT * scales.size_at_points(number)
             weights = np.where(contact.paired & touches, contact.measure, 0.0)
             way = motion.of_points(contact.own_displacement())
             gram += np.einsum("mqd,q,nqd->mn", jumps, weights, jumps)
             work += np.einsum("mqd,q,qd->m", jumps, weights, way)
-        comm = self._full.unknowns.comm
+        comm = self.full.unknowns.comm
         gram, work = global_sum(comm, gram), global_sum(comm, work)
         return agreed(comm, np.linalg.lstsq(gram, work, rcond=_SHARED)[0])
 
@@ -188,8 +186,8 @@ class Approach:
         Yields:
             Motion in the increment of the obstacle of every contact.
         """
-        self._full.evaluate_at(self._before)
-        contacts = self._full.contacts
+        self.full.evaluate_at(self.before)
+        contacts = self.full.contacts
         motions = [contact.opposite.motion_in_increment(contact.values) for contact in contacts]
         with contextlib.ExitStack() as back:
             for contact, motion in zip(contacts, motions, strict=True):
@@ -205,11 +203,11 @@ class Approach:
         Returns:
             Whether there is such a place.
         """
-        here = self._full.state()
+        here = self.full.state()
         for along in (_ALONG, np.inf):
             if self._lands(which, along):
                 return True
-            self._full.evaluate_at(here)
+            self.full.evaluate_at(here)
         free = self._free(which)
         way = None if free is None else self._to_first_touch(free)
         if way is not None:
@@ -222,35 +220,35 @@ class Approach:
         Returns:
             (n_free, n_local), and for every contact (n_free, n_points, gdim).
         """
-        fields, at_points = self._motions.present(self._full.operators)
+        fields, at_points = self.motions.present(self.full.operators)
         return fields[which], [jumps[which] for jumps in at_points]
 
     def _free(self, which: Index) -> _Free | None:
         """The free motions of these numbers; None: the load drives none. Collective."""
-        comm = self._full.unknowns.comm
+        comm = self.full.unknowns.comm
         fields, jumps = self._felt(which)
-        drive = global_sum(comm, fields @ self._load)
+        drive = global_sum(comm, fields @ self.load)
         most = np.abs(drive).max()
         mass = global_sum(comm, fields @ fields.T)
-        opposites = [contact.opposite for contact in self._full.contacts]
+        opposites = [contact.opposite for contact in self.full.contacts]
         jumps = [o.displaced_directions(j) for o, j in zip(opposites, jumps, strict=True)]
         return _Free(which, drive / most, mass, jumps) if most > 0 else None
 
     def _move(self, which: Index, coefficients: Array) -> None:
         """Let free motions of these numbers go on from here, by their coefficients. Collective."""
-        full, motions = self._full, self._motions
+        full, motions = self.full, self.motions
         every = np.zeros(len(motions.free))
         every[which] = coefficients
         way = motions.displacement(every)
-        self._full.evaluate_at(full.state() + np.where(full.constrained, 0.0, way))
+        full.evaluate_at(full.state() + np.where(full.constrained, 0.0, way))
 
     def _to_first_touch(self, free: _Free) -> Array | None:
         """The way by which the load leads to first touch; None: it meets nothing. Collective."""
-        comm = self._full.unknowns.comm
+        comm = self.full.unknowns.comm
         coefficients = agreed(comm, np.linalg.solve(free.mass, free.drive))
         coefficients /= np.abs(coefficients).max()
         way = np.inf
-        for contact, jumps in zip(self._full.contacts, free.jumps, strict=True):
+        for contact, jumps in zip(self.full.contacts, free.jumps, strict=True):
             values = contact.values
             jump = np.tensordot(coefficients, jumps, axes=1)
             closing = np.einsum("qd,qd->q", jump, values.normal)
@@ -270,7 +268,7 @@ class Approach:
             which: Numbers of their free motions.
             along: The largest share of a motion that may go along a Γc that grips.
         """
-        full, comm = self._full, self._full.unknowns.comm
+        full, comm = self.full, self.full.unknowns.comm
         free = self._free(which)
         if free is None:
             return False
@@ -311,10 +309,10 @@ class Approach:
             Coefficients of the free motions; None: such motions are none, are little of what the
             load drives, as those in a corner are, or do not end.
         """
-        motions, comm, drive = self._motions, self._full.unknowns.comm, free.drive
+        motions, comm, drive = self.motions, self.full.unknowns.comm, free.drive
         grams: Array = np.zeros((2, len(drive), len(drive)))
         rows = []
-        for contact, jumps in zip(self._full.contacts, free.jumps, strict=True):
+        for contact, jumps in zip(self.full.contacts, free.jumps, strict=True):
             values, weights = contact.values, contact.quadrature.weights
             closing = np.einsum("mqd,qd->qm", jumps, values.normal)
             rubs = tangential_gram(contact, jumps, closed_only=False)
