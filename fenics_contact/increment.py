@@ -18,7 +18,7 @@ from fenics_contact.failure import NotConverged
 from fenics_contact.methods.approach import Approach
 from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.first_touch import count_slip_from_touch
-from fenics_contact.methods.load_balance import LoadBalance
+from fenics_contact.methods.load_balance import check_balance, find_free_modes
 from fenics_contact.methods.opposite_points import OppositePoints
 from fenics_contact.methods.solver import Solver
 from fenics_contact.methods.unloaded_bodies import move_unloaded_bodies
@@ -64,39 +64,23 @@ class Increment:
         return outcome
 
 
+@dataclass(frozen=True)
 class IncrementSolver:
     """Solves increments of a problem. It changes u and the contacts, and no state.
 
     Attributes:
+        full: The system on all unknowns.
+        solver: What solves it.
         judge: What verifies a solution.
         modulus: Young's modulus at Γc, as far as it follows the data of the bulk.
+        prefix: Of PETSc options, for messages.
     """
 
-    def __init__(
-        self,
-        full: FullSystem,
-        solver: Solver,
-        judge: Judge,
-        *,
-        modulus: FollowedModulus,
-        balance: LoadBalance,
-        prefix: str,
-    ) -> None:
-        """Take the parts of a problem.
-
-        Args:
-            full: The system on all unknowns.
-            solver: What solves it.
-            judge: See the attributes.
-            modulus: See the attributes.
-            balance: Whether contact can balance a load.
-            prefix: Of PETSc options, for messages.
-        """
-        self.judge, self.modulus = judge, modulus
-        self._full, self._solver = full, solver
-        self._balance, self._prefix = balance, prefix
-        self._bulk, self._contacts, self._comm = full.bulk, full.contacts, full.unknowns.comm
-        self._u = full.displacement.whole
+    full: FullSystem
+    solver: Solver
+    judge: Judge
+    modulus: FollowedModulus
+    prefix: str
 
     # ---- what is given ---------------------------------------------------------------------------
 
@@ -106,22 +90,22 @@ class IncrementSolver:
         Args:
             balance: Whether to raise a ValueError for a load that contact cannot balance.
         """
-        self._bulk.check_finite()
-        for contact in self._contacts:
+        self.full.bulk.check_finite()
+        for contact in self.full.contacts:
             contact.check_input()
-        load = self._full.present_load()
-        size = global_max(self._comm, np.abs(load))
+        load = self.full.present_load()
+        size = global_max(self.full.unknowns.comm, np.abs(load))
         if not np.isfinite(size):
             raise ValueError(
                 "the external load, F at u = 0, is not finite (NaN or inf) at some dof: check the "
                 "loads, and the denominators in F (λ = E ν/((1 + ν)(1 - 2ν)) is infinite at "
                 "ν = 0.5)"
             )
-        check_values(self._full.bcs, self._u)
-        if self._bulk.has_new_data():
-            self._balance.find_free_modes(self._full)
-        if balance and self._bulk.linear:
-            self._balance.check(load, self._full.operators)
+        check_values(self.full.bcs, self.full.displacement.whole)
+        if self.full.bulk.has_new_data():
+            find_free_modes(self.solver.equations.motions, self.full)
+        if balance and self.full.bulk.linear:
+            check_balance(self.solver.equations.motions, load, self.full.operators)
         return load
 
     # ---- solving ---------------------------------------------------------------------------------
@@ -142,28 +126,28 @@ class IncrementSolver:
         Raises:
             NotConverged, ValueError: See `ContactProblem.solve`.
         """
-        solver, points = self._solver, increment.points
+        solver, points = self.solver, increment.points
         # Between points of its end a load that nothing balances is a failure of the increment.
         load = self._check_before(balance=not points.replaced)
         complete = present.interior is None and state.interior is None
         if complete and points.contacts and not (increment.tried or points.replaced):
             self._predict_opposite_points(points, state, load)
-        before = self._full.state()
-        self._full.prescribe()
+        before = self.full.state()
+        self.full.prescribe()
         solver.starts.moved_from(before)
-        stiffness_changed = self._full.update_stiffness()
-        if stiffness_changed and self._bulk.linear:
+        stiffness_changed = self.full.update_stiffness()
+        if stiffness_changed and self.full.bulk.linear:
             self.modulus.measure()
-        approach = Approach(self._full, solver.equations.motions, load, before)
+        approach = Approach(self.full, solver.equations.motions, load, before)
         cold = approach.lead(first=state.increment == 0)
         if solver.chooses():
             return Again.UNKNOWNS
         solver.update_system(stiffness_changed)
-        self._full.scales.begin(self._full.operators)
+        self.full.scales.begin(self.full.operators)
         solver.system.begin(load)
         solver.equations.began = state.unknowns
-        led = np.where(self._full.constrained, before, self._full.state())
-        end = count_slip_from_touch(self._full, led, solver.end_without)
+        led = np.where(self.full.constrained, before, self.full.state())
+        end = count_slip_from_touch(self.full, led, solver.end_without)
         solver.starts.change = state.change
         solver.starts.expected = end if points.end is None else points.end
         with solver.system.acting():
@@ -179,7 +163,7 @@ class IncrementSolver:
         interior = solver.system.pending_field if lags else None
         if not lags:
             solver.system.complete(solver.system.pending_field)
-        self._full.evaluate()
+        self.full.evaluate()
         part = solver.system.part if lags else np.asarray
         if reason > 0 and move_unloaded_bodies(solver.equations, part) and solver.starts.factored:
             solver.starts.note_borne()
@@ -211,11 +195,11 @@ class IncrementSolver:
         self.judge.warn_of_large_motion(verdict)
         self.judge.warn_of_round_off(verdict)
         self.judge.warn_of_few_points()
-        loaded = [verdict.equations[contact.name].is_loaded for contact in self._contacts]
         trials = (
-            c.states.trial(is_loaded=some) for c, some in zip(self._contacts, loaded, strict=True)
+            c.states.trial(is_loaded=verdict.equations[c.name].is_loaded)
+            for c in self.full.contacts
         )
-        trial = Trial(self._full.state(), tuple(trials), load, energies, interior)
+        trial = Trial(self.full.state(), tuple(trials), load, energies, interior)
         step = Step(
             increment=state.increment + 1,
             reason=reason,
@@ -224,7 +208,7 @@ class IncrementSolver:
             method=increment.tried[-1].method,
             factorisations=solver.equations.factorisations,
             verdict=verdict,
-            contacts={c.name: c.resultants() for c in self._contacts},
+            contacts={c.name: c.resultants() for c in self.full.contacts},
             energy=energy,
             attempts=tuple(increment.tried),
             wall_seconds=time.perf_counter() - increment.started,
@@ -240,11 +224,11 @@ class IncrementSolver:
             state: The committed state, complete.
             load: External forces (force).
         """
-        before = self._full.state()
-        points.predict(state, self._full.prescribed_values(), load)
-        points.begin(self._contacts)
-        self._full.set_state(before)
-        for contact in self._contacts:
+        before = self.full.state()
+        points.predict(state, self.full.prescribed_values(), load)
+        points.begin(self.full.contacts)
+        self.full.set_state(before)
+        for contact in self.full.contacts:
             contact.states.forget()
 
     def _choose_pairs(
@@ -258,79 +242,78 @@ class IncrementSolver:
             interior: What recovers the interior displacement there; None: u is up to date.
         """
         if interior is not None:
-            self._solver.system.complete(interior)
-        increment.points.choose_states(contacts, self._full.state())
+            self.solver.system.complete(interior)
+        increment.points.choose_states(contacts, self.full.state())
         return increment.ends(Again.PAIRS)
 
     def _may_lag(self, state: State) -> bool:
         """Whether u can stay behind: energies and pairs must be found without it. Collective."""
-        if not (self._solver.condensed and self._bulk.symmetric):
+        contacts, comm = self.full.contacts, self.full.unknowns.comm
+        if not (self.solver.condensed and self.full.bulk.symmetric):
             return False
-        for contact in self._contacts:
+        for contact in contacts:
             # A body that has come to no pairs yet is looked for where it is.
-            alone = contact.opposite.may_pair_anew and not self._comm.allreduce(
-                int(contact.paired.any())
-            )
+            alone = contact.opposite.may_pair_anew and not comm.allreduce(int(contact.paired.any()))
             if alone or contact.opposite.pairs_anew:
                 return False
         # Of nodes that the quadrature points do not carry only a complete u tells where they are.
         carried = (
-            c.opposite.sampler is None or c.facet_places.points_carry_nodes for c in self._contacts
+            c.opposite.sampler is None or c.facet_places.points_carry_nodes for c in contacts
         )
         if not all(carried):
             return False
-        if self._solver.system.mark in state.energy.forces:
+        if self.solver.system.mark in state.energy.forces:
             return True
-        return state.increment == 0 and not self._comm.allreduce(int(state.unknowns.any()))
+        return state.increment == 0 and not comm.allreduce(int(state.unknowns.any()))
 
     def _not_converged(
         self, state: State, reason: int, verdict: Verdict, attempts: Sequence[Attempt]
     ) -> NotConverged:
-        told = {name for contact in self._contacts for name in contact.law.parameters()}
+        told = {name for contact in self.full.contacts for name in contact.law.parameters()}
         return NotConverged(
             state.increment + 1,
             reason,
             verdict,
             attempts,
-            prefix=self._prefix,
+            prefix=self.prefix,
             stiffnesses=[name for name in ("k_t", "k_n") if name in told],
-            driven=any(m.force and not m.turns for c in self._contacts for m in c.motions),
+            driven=any(m.force and not m.turns for c in self.full.contacts for m in c.motions),
         )
 
     # ---- verifying -------------------------------------------------------------------------------
 
     def _energy(self, state: State, energies: EnergyState, points: OppositePoints) -> Energy:
         """The energies of the increment that has ended in a state. Collective."""
-        began, mark = state.energy, self._solver.system.mark
-        if self._full.mark not in energies.forces and mark not in began.forces:
+        began, mark = state.energy, self.solver.system.mark
+        if self.full.mark not in energies.forces and mark not in began.forces:
             # From rest, of the retained dofs alone.
             nothing = Forces.none(np.zeros(1), np.zeros(1, dtype=np.intp))
             began = began.with_forces(mark, nothing)
         if points.replaced:
-            began = began.between(self._contacts)
-        return energies.since(began, self._contacts, self._full.scales)
+            began = began.between(self.full.contacts)
+        return energies.since(began, self.full.contacts, self.full.scales)
 
     def _judge_all(
         self, began: Array, *, kinematics: bool, assemble: bool
     ) -> tuple[Verdict, EnergyState]:
         """Judge a complete u by assembly, past SNES and its residual, or by K u. Collective."""
         if assemble:
-            bulk = self._full.with_obstacles(self._bulk.assemble_residual())
+            bulk = self.full.with_obstacles(self.full.bulk.assemble_residual())
         else:
-            bulk = self._full.product_force()
-        verdict, found = self.judge_system(self._full, bulk, began=began, kinematics=kinematics)
-        forces: dict[object, Forces] = {self._full.mark: found}
-        if self._solver.condensed and self._bulk.symmetric:
-            forces[self._solver.system.mark] = self._solver.system.present_forces()
-        return verdict, EnergyState.at(forces, self._contacts)
+            bulk = self.full.product_force()
+        verdict, found = self.judge_system(self.full, bulk, began=began, kinematics=kinematics)
+        forces: dict[object, Forces] = {self.full.mark: found}
+        if self.solver.condensed and self.full.bulk.symmetric:
+            forces[self.solver.system.mark] = self.solver.system.present_forces()
+        return verdict, EnergyState.at(forces, self.full.contacts)
 
     def _judge_kept(self, began: Array, *, kinematics: bool) -> tuple[Verdict, EnergyState]:
         """Judge the condensed equations; u stays behind. Collective."""
-        system = self._solver.system
+        system = self.solver.system
         verdict, found = self.judge_system(
             system, system.bulk_force(), began=began, kinematics=kinematics
         )
-        return verdict, EnergyState.at({system.mark: found}, self._contacts)
+        return verdict, EnergyState.at({system.mark: found}, self.full.contacts)
 
     def judge_system(
         self,
@@ -348,12 +331,12 @@ class IncrementSolver:
             began: The state in which it began; None: see `Judge.judge`.
             kinematics: Whether to look at what small displacements leave out.
         """
-        equations = self._solver.equations
+        equations = self.solver.equations
         return self.judge.judge(
             system,
             bulk,
             start=equations.start,
             rtol=equations.rtol,
             began=began,
-            respond=self._solver.respond if kinematics else None,
+            respond=self.solver.respond if kinematics else None,
         )

@@ -26,7 +26,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.failure import NotConverged
 from fenics_contact.increment import Again, Increment, IncrementSolver
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
-from fenics_contact.methods.load_balance import LoadBalance
+from fenics_contact.methods.load_balance import find_free_modes
 from fenics_contact.methods.opposite_points import OppositePoints
 from fenics_contact.methods.solver import Settings, Solver
 from fenics_contact.parallel import fail_together, global_max, warn
@@ -177,20 +177,12 @@ class ContactProblem:
         bulk.check_elastic()
         modulus = FollowedModulus(bulk, self.displacement, self.contacts)
         self.motions = RigidBodyModes(self.full)
-        balance = LoadBalance(self.motions)
         self.initial_penetration = check_start(self.contacts)
-        balance.find_free_modes(self.full)
+        find_free_modes(self.motions, self.full)
         self.full.scales.begin(self.full.operators)
         judge = Judge(self.full, self.motions, tolerance=tolerance, cross_check=cross_check)
         self.solver = Solver(self.full, self.motions, settings)
-        self._increments = IncrementSolver(
-            self.full,
-            self.solver,
-            judge,
-            modulus=modulus,
-            balance=balance,
-            prefix=prefix,
-        )
+        self._increments = IncrementSolver(self.full, self.solver, judge, modulus, prefix)
         self.full.evaluate()
         self.state = self._initial_state()
         self._trial: Trial | None = None

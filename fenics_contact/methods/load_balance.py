@@ -17,10 +17,9 @@ from fenics_contact.parallel import agreed, gather_rows
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
-from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index
 
-__all__ = ["LoadBalance", "unbalanced"]
+__all__ = ["check_balance", "find_free_modes", "unbalanced"]
 
 # Generalised forces relative to the largest that the load could exert, and entries of unit modes at
 # the points, that are zero.
@@ -32,128 +31,99 @@ _CONE_SIDES = 64
 _SOME_RAYS = 2000
 
 
-class LoadBalance:
-    """Static admissibility of loads on the free rigid-body modes of a problem."""
+def find_free_modes(modes: RigidBodyModes, full: FullSystem) -> None:
+    """Find the rigid-body modes that are free with the present data of the bulk. Collective.
 
-    def __init__(self, modes: RigidBodyModes) -> None:
-        """Take the modes; nothing is checked yet."""
-        self._modes = modes
-        # The geometry of contact that was looked at last: this rank's part of it, admissible
-        # generalised forces of all ranks, and of every group of modes the resultant balanced last.
-        self._geometry: list[Array] = []
-        self._rays: Array = np.zeros((0, 0))
-        self._groups: list[tuple[Index, Array]] = []
+    Args:
+        modes: The modes.
+        full: The system on all unknowns, its contacts evaluated.
 
-    def find_free_modes(self, full: FullSystem) -> None:
-        """Find the rigid-body modes that are free with the present data of the bulk. Collective.
+    Raises:
+        ValueError: No contact resists one of them, even if all of Γc were closed; it names it.
+    """
+    with full.stiffness_at_rest() as stiffness:
+        full.scales.measure_stiffness(stiffness)
+        modes.find_free(stiffness, full.constrained)
+    loose = modes.unconstrained(full.operators, closed_only=False) @ modes.free
+    if loose.size:
+        motions = "; ".join(modes.describe(row) for row in loose)
+        finite = any(contact.finite for contact in full.contacts)
+        order = " to first order" if finite else ""
+        raise ValueError(
+            f"neither Dirichlet conditions nor contact constrain this rigid-body mode{order}: "
+            f"{motions}. Add a Dirichlet condition that constrains it, or friction"
+        )
+    full.bulk.note_data()
 
-        Args:
-            full: The system on all unknowns, its contacts evaluated.
 
-        Raises:
-            ValueError: No contact resists one of them, even if all of Γc were closed; it names it.
-        """
-        modes = self._modes
-        with full.stiffness_at_rest() as stiffness:
-            full.scales.measure_stiffness(stiffness)
-            modes.find_free(stiffness, full.constrained)
-        loose = modes.unconstrained(full.operators, closed_only=False) @ modes.free
-        if loose.size:
-            motions = "; ".join(modes.describe(row) for row in loose)
-            finite = any(contact.finite for contact in full.contacts)
-            order = " to first order" if finite else ""
-            raise ValueError(
-                f"neither Dirichlet conditions nor contact constrain this rigid-body mode{order}: "
-                f"{motions}. Add a Dirichlet condition that constrains it, or friction"
-            )
-        full.bulk.note_data()
+def check_balance(modes: RigidBodyModes, load: Array, operators: Sequence[ContactOperator]) -> None:
+    """Refuse a load whose resultant no admissible contact forces can balance. Collective.
 
-    def check(self, load: Array, operators: Sequence[ContactOperator]) -> None:
-        """Refuse a load whose resultant no admissible contact forces can balance. Collective.
+    The contact may push anywhere on Γc, and rub within the friction cone: a necessary condition
+    only, but it finds a body pulled off its obstacle, tipped over its edge or pushed along it.
+    Bodies that no contact couples are looked at apart.
 
-        The contact may push anywhere on Γc, and rub within the friction cone: a necessary
-        condition only, but it finds a body pulled off its obstacle, tipped over its edge or pushed
-        along it. Bodies that no contact couples are looked at apart.
+    Args:
+        modes: The free rigid-body modes.
+        load: External forces at this rank's unknowns (force).
+        operators: Of evaluated contacts, over all unknowns.
 
-        Args:
-            load: External forces at this rank's unknowns (force).
-            operators: Of evaluated contacts, over all unknowns.
+    Raises:
+        ValueError: It gives the resultant and the mode.
+    """
+    rows = modes.straight()  # arms turn with an obstacle: what it cannot bear here it may there
+    resultant, size = modes.load_resultant(load, operators)
+    if not resultant.any():
+        return
+    comm = modes.comm
+    mine = [_admissible_forces(o, modes.at_points(o)[rows]) for o in operators]
+    every = gather_rows(comm, np.concatenate([np.zeros((0, len(rows))), *mine]))
+    felt = (np.abs(every) > _FELT).astype(np.float64)
+    couples = felt.T @ felt + modes.of_same_body()[np.ix_(rows, rows)]
+    n_groups, label = scipy.sparse.csgraph.connected_components(couples, directed=False)
+    beyond: list[str] = []
+    for group in (np.flatnonzero(label == number) for number in range(n_groups)):
+        largest = np.abs(resultant[group]).max()
+        if largest == 0.0:
+            continue
+        direction, rays = -resultant[group] / largest, every[:, group]
+        # Unit columns: a ray's length has no meaning, and badly scaled ones spoil the solution. One
+        # of rounding only, such as of tangential forces on a mode across them, is none.
+        length = np.linalg.norm(rays, axis=1)
+        rays = rays[length > _FELT] / length[length > _FELT, None]
+        rest = agreed(comm, unbalanced(rays.T, direction)) if len(rays) else 1.0
+        allowed = _BALANCED * max(1.0, size[group].max() / largest)
+        if rest > allowed:
+            limits = agreed(comm, _largest_forces(rays.T, direction)) + 0.0  # no -0
+            beyond += _describe(modes, rows[group], direction, limits, allowed, largest)
+    if beyond:
+        raise ValueError(
+            "no contact force can balance the load: its resultant along the free motion "
+            f"{', and along '.join(beyond)}. Contact forces are compressive and within the "
+            "friction cone. Check the sign and magnitude of the load, and the normals, "
+            "or add a Dirichlet condition"
+        )
 
-        Raises:
-            ValueError: It gives the resultant and the mode.
-        """
-        modes = self._modes
-        rows = modes.straight()  # arms turn with an obstacle: what it cannot bear here it may there
-        resultant, size = modes.load_resultant(load, operators)
-        if not resultant.any():
-            return
-        self._update_rays(operators, rows)
-        beyond: list[str] = []
-        for number, (group, balanced) in enumerate(self._groups):
-            wanted, largest = -resultant[group], np.abs(resultant[group]).max()
-            if largest == 0.0:
-                continue
-            # A history often has one direction of load: what balanced it does again.
-            direction = wanted / largest
-            if _alike(direction, balanced):
-                continue
-            rays = self._rays[:, group]
-            # Unit columns: a ray's length has no meaning, and badly scaled ones spoil the solution.
-            # One of rounding only, such as of tangential forces on a mode across them, is none.
-            length = np.linalg.norm(rays, axis=1)
-            rays = rays[length > _FELT] / length[length > _FELT, None]
-            comm, rest = modes.comm, 1.0
-            if len(rays):
-                rest = agreed(comm, unbalanced(rays.T, direction))
-            allowed = _BALANCED * max(1.0, size[group].max() / largest)
-            if rest > allowed:
-                limits = agreed(comm, _largest_forces(rays.T, direction)) + 0.0  # no -0
-                beyond += self._describe(rows[group], direction, limits, allowed, largest)
-            else:
-                self._groups[number] = group, direction
-        if beyond:
-            raise ValueError(
-                "no contact force can balance the load: its resultant along the free motion "
-                f"{', and along '.join(beyond)}. Contact forces are compressive and within the "
-                "friction cone. Check the sign and magnitude of the load, and the normals, "
-                "or add a Dirichlet condition"
-            )
 
-    def _describe(
-        self, rows: Index, wanted: Array, limits: Array, allowed: float, largest: float
-    ) -> list[str]:
-        """What of a resultant, relative to its largest component, contact cannot bear, in words."""
-        named = [self._modes.describe(self._modes.free[row]) for row in rows]
-        # NaN: not even the other components can be borne.
-        found = [
-            f"({name}) is {-largest * force:.6g}, of which contact can balance at most "
-            f"{largest * limit:.6g} with the other components unchanged"
-            for name, force, limit in zip(named, wanted, limits, strict=True)
-            if abs(force) > limit + allowed
-        ]
-        worst = int(np.argmax(np.abs(wanted)))
-        return found or [f"({named[worst]}) is {-largest * wanted[worst]:.6g}"]
-
-    def _update_rays(self, operators: Sequence[ContactOperator], rows: Index) -> None:
-        """Find the admissible generalised forces, and modes that these couple. Collective."""
-        modes, geometry = self._modes, [self._modes.free]
-        for contact in (operator.contact for operator in operators):
-            geometry += [contact.values.normal, _bearing_normals(contact)]
-            geometry += [contact.values.friction_bound_ratio, np.array([contact.pairs.number])]
-        known = len(geometry) == len(self._geometry)
-        known = known and all(map(_alike, geometry, self._geometry))
-        if modes.comm.allreduce(int(not known)) == 0:
-            return
-        self._geometry = geometry
-        rays = [
-            _admissible_forces(operator, modes.at_points(operator)[rows]) for operator in operators
-        ]
-        self._rays = gather_rows(modes.comm, np.concatenate([np.zeros((0, len(rows))), *rays]))
-        felt = (np.abs(self._rays) > _FELT).astype(np.float64)
-        couples = felt.T @ felt + modes.of_same_body()[np.ix_(rows, rows)]
-        n_groups, label = scipy.sparse.csgraph.connected_components(couples, directed=False)
-        groups = [np.flatnonzero(label == group) for group in range(n_groups)]
-        self._groups = [(group, np.zeros(0)) for group in groups]
+def _describe(
+    modes: RigidBodyModes,
+    rows: Index,
+    wanted: Array,
+    limits: Array,
+    allowed: float,
+    largest: float,
+) -> list[str]:
+    """What of a resultant, relative to its largest component, contact cannot bear, in words."""
+    named = [modes.describe(modes.free[row]) for row in rows]
+    # NaN: not even the other components can be borne.
+    found = [
+        f"({name}) is {-largest * force:.6g}, of which contact can balance at most "
+        f"{largest * limit:.6g} with the other components unchanged"
+        for name, force, limit in zip(named, wanted, limits, strict=True)
+        if abs(force) > limit + allowed
+    ]
+    worst = int(np.argmax(np.abs(wanted)))
+    return found or [f"({named[worst]}) is {-largest * wanted[worst]:.6g}"]
 
 
 def _admissible_forces(operator: ContactOperator, modes: Array) -> Array:
@@ -185,10 +155,6 @@ def _admissible_forces(operator: ContactOperator, modes: Array) -> Array:
         directions += [pushes, -pushes] if law.has_tension else [pushes]
     rays = [np.einsum("mqd,qd->qm", modes, direction) for direction in directions]
     return np.concatenate([np.zeros((0, len(modes))), *rays])
-
-
-def _alike(one: Array, other: Array) -> bool:
-    return one.shape == other.shape and np.allclose(one, other, rtol=0.0, atol=ROUND_OFF)
 
 
 def unbalanced(rays: Array, resultant: Array) -> float:

@@ -22,7 +22,7 @@ from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.continuation import Continuation
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.kept import Kept
-from fenics_contact.methods.load_balance import LoadBalance
+from fenics_contact.methods.load_balance import check_balance
 from fenics_contact.methods.method import Method, Newton, OwnMethod, SnesMethod, Tools
 from fenics_contact.methods.neighbourhood import linearised, respond
 from fenics_contact.methods.options import Defaults, take_command_line
@@ -503,8 +503,8 @@ class Solver:
         """The method, and those that follow while none converges. Collective.
 
         Raises:
-            ValueError: Contact cannot balance the load on a nonlinear body (`LoadBalance.check`),
-                which may change as the body deforms: it is checked after a failure alone.
+            ValueError: Contact cannot balance the load on a nonlinear body (`check_balance`), which
+                may change as the body deforms: it is checked after a failure alone.
         """
         yield self.method
         if fallback and balance and not self._full.bulk.linear:
@@ -513,7 +513,7 @@ class Solver:
             self.equations.set_state(x)
             x.destroy()
             self._full.evaluate()
-            LoadBalance(self.equations.motions).check(self._full.load, self._full.operators)
+            check_balance(self.equations.motions, self._full.load, self._full.operators)
         if fallback and self.may_go_on():
             others = (name for name in _FALLBACKS if name != self.method)
             yield from (name for name in others if self.methods[name].suits)
