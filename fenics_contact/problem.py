@@ -34,7 +34,6 @@ from fenics_contact.state import State, Trial
 from fenics_contact.step import Step
 from fenics_contact.systems import linear
 from fenics_contact.systems.bulk import Bulk
-from fenics_contact.systems.committed import CommittedState
 from fenics_contact.systems.followed import FollowedModulus
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
@@ -42,7 +41,10 @@ from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array
 
-__all__ = ["ContactProblem"]
+__all__ = ["N_ROWS", "ContactProblem"]
+
+# Rows of `ContactProblem.committed_rows`.
+N_ROWS = 7
 
 
 class ContactProblem:
@@ -527,10 +529,16 @@ class ContactProblem:
 
     # ---- going on in another run -----------------------------------------------------------------
 
-    def committed_state(self) -> CommittedState:
-        """Return the committed state from which another run can continue. Collective.
+    def committed_rows(self) -> Array:
+        """Return the committed state, from which another run can continue, as rows. Collective.
 
         The interior displacement is recovered first, if it is out of date.
+
+        Returns:
+            Array (N_ROWS, n_local) over this rank's unknowns: their values and the change of these
+            in the last increment (length); internal forces, external forces and the change of these
+            (force); masks of the unknowns retained by static condensation, and of those with
+            Dirichlet conditions.
 
         Raises:
             ValueError: The present state is not that of the last commit.
@@ -545,23 +553,13 @@ class ContactProblem:
                 "were changed; call commit() or restore() before saving the state"
             )
         self.complete()
-        state = self.state
-        forces = state.energy.forces[self.full.mark]
-        kept = np.zeros(self.full.unknowns.n_local, dtype=bool)
+        state, forces = self.state, self.state.energy.forces[self.full.mark]
+        change = np.zeros_like(state.load) if state.change is None else state.change
+        retained = np.zeros_like(state.load)
         if self.solver.condensed:
-            kept[self.solver.system.unknowns.kept] = True
-        return CommittedState(
-            state=state.unknowns,
-            change=np.zeros_like(state.load) if state.change is None else state.change,
-            internal=forces.internal,
-            external=forces.external,
-            load_change=state.load_change,
-            kept=kept,
-            constrained=self.full.constrained,
-            increment=state.increment,
-            expected=self.expected_increments,
-            pairs_anew=tuple(contact.opposite.pairs_anew for contact in self.contacts),
-        )
+            retained[self.solver.system.unknowns.kept] = 1.0
+        loads = [forces.internal, forces.external, state.load_change]
+        return np.stack([state.unknowns, change, *loads, retained, self.full.constrained])
 
     @contextmanager
     def at_state(self, state: Array) -> Iterator[None]:
@@ -582,37 +580,41 @@ class ContactProblem:
             modulus.put_back(measured)
 
     def set_committed(
-        self, taken: CommittedState, points: Sequence[tuple[Array, Mapping[str, Array]]]
+        self,
+        rows: Array,
+        numbers: Sequence[float] | Array,
+        points: Sequence[tuple[Array, Mapping[str, Array]]],
     ) -> None:
-        """Continue from the state that `committed_state` returned in another run. Collective.
+        """Continue from the state that `committed_rows` returned in another run. Collective.
 
         The loads must be those of that state.
 
         Args:
-            taken: The state.
+            rows: The state.
+            numbers: Increments so far, `expected_increments`, and for every contact whether its
+                pairs are found anew.
             points: For every contact, what `ContactStates.load_restart` takes: history, values.
         """
-        self.expected_increments = taken.expected
+        state, change, internal, external, load_change, retained, _ = rows
+        increment, self.expected_increments, *anew = (int(number) for number in numbers)
         self._fresh, self._trial = False, None
-        self.solver.keep(np.flatnonzero(taken.kept).astype(np.int32))
-        self.full.set_state(taken.state)
+        self.solver.keep(np.flatnonzero(retained).astype(np.int32))
+        self.full.set_state(state)
         load = self.full.present_load()
         self.full.begin(load)
-        for contact, (history, values), anew in zip(
-            self.contacts, points, taken.pairs_anew, strict=True
-        ):
-            contact.states.load_restart(history, values, anew=anew)
-        found = Forces(taken.state, taken.internal, taken.external, self.full.label)
+        for contact, (history, values), again in zip(self.contacts, points, anew, strict=True):
+            contact.states.load_restart(history, values, anew=bool(again))
+        found = Forces(state, internal, external, self.full.label)
         forces: dict[object, Forces] = {self.full.mark: found}
         energy = EnergyState.at(forces, self.contacts)
         self.state = State(
-            unknowns=taken.state.copy(),
+            unknowns=state.copy(),
             contacts=tuple(contact.states.committed for contact in self.contacts),
             load=load,
             energy=energy.between(self.contacts),
-            change=taken.change.copy() if global_max(self._comm, np.abs(taken.change)) else None,
-            load_change=taken.load_change.copy(),
-            increment=taken.increment,
+            change=change.copy() if global_max(self._comm, np.abs(change)) else None,
+            load_change=load_change.copy(),
+            increment=increment,
         )
         self.restart_solver()
 

@@ -142,11 +142,11 @@ def picture(made: History) -> dict[str, Array]:
     problem = made.problem
     found = {"u": _nodal(problem, problem.u), "increment": np.array([problem.increment])}
     field = fem.Function(problem.u.function_space)
-    committed = problem.committed_state()
-    for name in ("state", "internal", "external"):
-        owned(field)[:] = getattr(committed, name)[: problem.full.unknowns.n_dofs]
+    state, _, internal, external, *_ = problem.committed_rows()
+    for name, row in (("state", state), ("internal", internal), ("external", external)):
+        owned(field)[:] = row[: problem.full.unknowns.n_dofs]
         found[f"committed {name}"] = _nodal(problem, field)
-    found["state of obstacles"] = problem.full.unknowns.motions(committed.state)
+    found["state of obstacles"] = problem.full.unknowns.motions(state)
     energy = problem.state.energy
     found["springs"] = np.array([COMM.allreduce(sum(map(np.sum, energy.springs)))])
     if problem.solver.condensed:

@@ -48,7 +48,7 @@ from fenics_contact.histories.places import (
 )
 from fenics_contact.parallel import collective_errors, fail_together
 from fenics_contact.problem import ContactProblem
-from fenics_contact.systems.committed import CommittedState
+from fenics_contact.types import Array
 
 __all__ = [
     "Stored",
@@ -106,11 +106,11 @@ def save(
     comm = problem.u.function_space.mesh.comm
     check_fields(problem, state_fields)
     check_places(problem)
-    committed = problem.committed_state()
-    rows = committed.rows(problem.full.unknowns, problem.full.bulk)
+    rows = _in_units(problem, problem.committed_rows())
+    anew = [contact.opposite.pairs_anew for contact in problem.contacts]
     arrays = {
         "numbers": np.array(numbers, dtype=np.float64),
-        "state": committed.numbers,
+        "state": np.array([problem.increment, problem.expected_increments, *anew], np.float64),
         "motions": np.stack([problem.full.unknowns.motions(row) for row in rows]),
         **probe(problem),
     }
@@ -294,9 +294,7 @@ def take_up(
         by_row = nodes.reshape(len(nodes), len(motions), width).swapaxes(0, 1)
         rows[:, part.dofs] = by_row.reshape(len(motions), len(nodes) * width)
     joined = (problem.full.unknowns.joined(row, motions[i]) for i, row in enumerate(rows))
-    committed = CommittedState.from_rows(
-        np.stack(list(joined)), stored.arrays["state"], problem.full.unknowns, problem.full.bulk
-    )
+    committed = _in_units(problem, np.stack(list(joined)), back=True)
     points, given = [], []
     for contact in problem.contacts:
         places, (data, layout) = point_places(contact), stored.scene["contacts"][contact.name]
@@ -315,7 +313,7 @@ def take_up(
             loads()
         for field, row in zip(state_fields, own, strict=True):
             set_rows(field, row)
-        with problem.at_state(committed.state):
+        with problem.at_state(committed[0]):
             differences = changed_data(stored, problem, committed, given)
         if on_mismatch == "refuse":
             refuse(
@@ -332,4 +330,13 @@ def take_up(
         logger.warning(
             "continuing from %s with changed data: %s", stored.path, "; ".join(differences)
         )
-    problem.set_committed(committed, points)
+    problem.set_committed(committed, stored.arrays["state"], points)
+
+
+def _in_units(problem: ContactProblem, rows: Array, *, back: bool = False) -> Array:
+    """Rows of a committed state, those at dofs in the user's units, or ``back`` from them."""
+    bulk, n, found = problem.full.bulk, problem.full.unknowns.n_dofs, rows.copy()
+    for i in range(5):  # two rows of displacements, three of forces
+        convert = bulk.from_units if (i < 2) != back else bulk.in_units
+        found[i, :n] = convert(rows[i, :n])
+    return found

@@ -20,8 +20,7 @@ from fenics_contact.histories.signature import signature_of_law, signature_of_ob
 from fenics_contact.obstacles.base import SampledObstacle
 from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import global_max, global_sum
-from fenics_contact.problem import ContactProblem
-from fenics_contact.systems.committed import N_ROWS, CommittedState
+from fenics_contact.problem import N_ROWS, ContactProblem
 from fenics_contact.types import Array
 
 __all__ = ["changed_data", "data_of", "data_words", "fixed_words", "probe", "why_another_scene"]
@@ -43,7 +42,7 @@ def why_another_scene(
 def changed_data(
     stored: Stored,
     problem: ContactProblem,
-    committed: CommittedState,
+    committed: Array,
     given: Sequence[dict[str, Array]],
 ) -> list[str]:
     """What of the data is not as in a file, in words. Collective.
@@ -51,7 +50,7 @@ def changed_data(
     Args:
         stored: What was read.
         problem: At the state of the file.
-        committed: The state of the file.
+        committed: The state of the file, see `ContactProblem.committed_rows`.
         given: Data at the points of every contact.
     """
     differences = _compare_words(stored.scene["data"], data_words(problem))
@@ -230,9 +229,9 @@ def _compare_probes(problem: ContactProblem, theirs: dict[str, Array]) -> list[s
     return differences
 
 
-def _compare_conditions(problem: ContactProblem, committed: CommittedState) -> list[str]:
+def _compare_conditions(problem: ContactProblem, committed: Array) -> list[str]:
     """Which components are prescribed, and their values, at a state."""
-    comm, mask = problem.u.function_space.mesh.comm, committed.constrained
+    comm, then, mask = problem.u.function_space.mesh.comm, committed[0], committed[-1] > 0
     differ = int(global_sum(comm, np.count_nonzero(mask != problem.full.constrained)))
     if differ:
         theirs, ours = global_sum(comm, [mask.sum(), problem.full.constrained.sum()])
@@ -240,7 +239,7 @@ def _compare_conditions(problem: ContactProblem, committed: CommittedState) -> l
             f"Dirichlet conditions: {theirs:.0f} components of nodes are prescribed in the file "
             f"and {ours:.0f} here, and {differ} of them are not the same"
         ]
-    now, then = problem.full.prescribed_values(), committed.state
+    now = problem.full.prescribed_values()
     # A direct solver leaves its round-off where values are prescribed, too.
     floor = _ROUND_OFF * global_max(comm, np.abs(then))
     return _largest_difference(
