@@ -225,7 +225,7 @@ class CondensedSystem(System):
 
     def prepare(self, ksp: PETSc.KSP, matrix: PETSc.Mat) -> None:
         """Have a solver factor a matrix of `matrix`, and correct the factors for the next ones."""
-        ksp.setOperators(matrix)
+        super().prepare(ksp, matrix)
         ksp.pc.setType("python")
         ksp.pc.setPythonContext(UpdatedLU())
 

@@ -100,10 +100,6 @@ class FullSystem(System):
         with self.bulk.stiffness_at_rest() as stiffness:
             yield self.unknowns.widened(stiffness, rows=True)
 
-    def update(self) -> int:
-        """Nothing to do: `fill` takes the stiffness as it is."""
-        return 0
-
     def state(self) -> Array:
         """The present unknowns of this rank; a copy."""
         values = self.bulk.in_units(self.u.x.array[: self.unknowns.n_dofs])
@@ -179,26 +175,10 @@ class FullSystem(System):
         moved = global_max(self.unknowns.comm, np.abs(state[self._moves]))
         return np.where(self._moves, terms, self.bulk.scale * moved)
 
-    def part(self, state: Array) -> Array:
-        """All of it."""
-        return state
-
-    def extended(self, change: Array) -> Array:
-        """There is nothing outside."""
-        return change
-
     def begin(self, load: Array) -> None:
         """Start an increment under a load, u with its conditions. Collective."""
         self.load = load
         self.prescribed = self.state()[self.constrained]
-
-    @property
-    def pending_field(self) -> Array | None:
-        """None: there is nothing outside."""
-        return None
-
-    def complete(self, field: Array | None) -> None:
-        """There is nothing outside."""
 
     def forces(self, bulk: Array, reaction: Array) -> Forces:
         """Forces at all unknowns; see `System.forces`."""
@@ -289,10 +269,6 @@ class FullSystem(System):
     def linear_solver(self, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
         """Options of the solver for `matrix`; see `linear.options`."""
         return linear.options(self.linear_kind, symmetric=symmetric, accurate=accurate)
-
-    def prepare(self, ksp: PETSc.KSP, matrix: PETSc.Mat) -> None:
-        """Give a solver a matrix of `matrix`. Collective."""
-        ksp.setOperators(matrix)
 
     def fill(self, matrix: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> int:
         """Bulk tangent plus contact, conditions applied, dimensionless; see `System.fill`."""

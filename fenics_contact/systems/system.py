@@ -274,13 +274,13 @@ class System(ABC):
     def set_state(self, state: Array) -> None:
         """Make a state the present one. Collective."""
 
-    @abstractmethod
     def part(self, state: Array) -> Array:
-        """What of a state of all unknowns is in this system."""
+        """What of a state of all unknowns is in this system, by default all of it. Collective."""
+        return state
 
-    @abstractmethod
     def extended(self, change: Array) -> Array:
         """The change of all unknowns that one of those in this system brings along. Collective."""
+        return change
 
     # ---- an increment ----------------------------------------------------------------------------
 
@@ -289,17 +289,17 @@ class System(ABC):
         """Start an increment under a load over all unknowns, u with its conditions. Collective."""
 
     @property
-    @abstractmethod
     def pending_field(self) -> Array | None:
         """What `complete` needs of the present increment; None: nothing is outside."""
+        return None
 
-    @abstractmethod
     def complete(self, field: Array | None) -> None:
-        """Find the unknowns outside of the system for those inside. Collective.
+        """Find the unknowns outside of the system for those inside, if there are any. Collective.
 
         Args:
             field: What `pending_field` was in the increment that set those inside.
         """
+        return
 
     @abstractmethod
     def forces(self, bulk: Array, reaction: Array) -> Forces:
@@ -333,9 +333,12 @@ class System(ABC):
 
     # ---- matrices --------------------------------------------------------------------------------
 
-    @abstractmethod
     def update(self) -> int:
-        """Take the bulk's tangent as it is now; number of factorisations. Collective."""
+        """Take the bulk's tangent as it is now; number of factorisations. Collective.
+
+        By default `fill` takes it as it is.
+        """
+        return 0
 
     @abstractmethod
     def matrix(self, *, symmetric: bool) -> PETSc.Mat:
@@ -353,9 +356,9 @@ class System(ABC):
     def linear_solver(self, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
         """Options of the solver for `matrix`; see `linear.options`."""
 
-    @abstractmethod
     def prepare(self, ksp: PETSc.KSP, matrix: PETSc.Mat) -> None:
         """Give a solver a matrix of `matrix`. Collective."""
+        ksp.setOperators(matrix)
 
     @property
     def pattern_changes(self) -> bool:
