@@ -10,6 +10,7 @@ import dolfinx
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact.types import Array
@@ -27,6 +28,7 @@ __all__ = [
     "gmsh_data",
     "interpolation_points",
     "option_was_read",
+    "sparse_matrix",
 ]
 
 if tuple(map(int, dolfinx.__version__.split(".")[:2])) < (0, 9):
@@ -92,6 +94,22 @@ def option_was_read(name: str) -> bool:
     library = ctypes.CDLL(PETSc.__file__)
     library.PetscOptionsUsed(None, name.encode(), ctypes.byref(read))
     return bool(read.value)
+
+
+def sparse_matrix(
+    comm: MPI.Comm, n_columns: int, pointers: Any, columns: Any, values: Array
+) -> PETSc.Mat:
+    """A matrix of this rank's rows, with the integers of this PETSc. Collective.
+
+    Args:
+        comm: The ranks.
+        n_columns: Number of the columns that this rank owns.
+        pointers: Where the entries of each row begin and end, (n_rows + 1,).
+        columns: Global columns of the entries, (n_entries,).
+        values: The entries, (n_entries,).
+    """
+    csr = *(np.asarray(numbers, dtype=PETSc.IntType) for numbers in (pointers, columns)), values
+    return PETSc.Mat().createAIJ(((len(pointers) - 1, None), (n_columns, None)), csr=csr, comm=comm)
 
 
 def cell_partitioner(ghost_mode: dolfinx.mesh.GhostMode) -> Any:

@@ -28,6 +28,7 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
+from fenics_contact.compat import sparse_matrix
 from fenics_contact.contact.kinematics import Seen, combined, tangential
 from fenics_contact.contact.pairs import Pairs, PairsState
 from fenics_contact.contact.values import PointValues
@@ -276,15 +277,8 @@ class PresentPairs(Pairs):
         columns = at[:, :, None] * bs + np.arange(d)[None, None, :, None]
         kept = np.abs(values) > ROUND_OFF
         pointers = np.concatenate([[0], np.cumsum(kept.sum(axis=3).ravel())])
-        return PETSc.Mat().createAIJ(
-            ((n * 2 * d * d, None), (space.dofmap.index_map.size_local * bs, None)),
-            csr=(
-                pointers.astype(PETSc.IntType),
-                columns[kept].astype(PETSc.IntType),
-                values[kept],
-            ),
-            comm=space.mesh.comm,
-        )
+        n_columns = space.dofmap.index_map.size_local * bs
+        return sparse_matrix(space.mesh.comm, n_columns, pointers, columns[kept], values[kept])
 
     def tangent(self, by_felt: Array, traction: Array, history: PointFields) -> Array:
         """Derivative of the point's forces on its local unknowns by these.

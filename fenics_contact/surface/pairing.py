@@ -23,6 +23,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from fenics_contact.compat import sparse_matrix
 from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import collective_errors, gather_rows, global_max, global_mean
 from fenics_contact.surface.facets import tabulate
@@ -374,15 +375,7 @@ class Pairing:
         )
         local = scipy.sparse.kron(local, np.eye(d), format="csr")
         first = self._comm.scan(m * d) - m * d
-        return PETSc.Mat().createAIJ(
-            ((n * d, None), (m * d, None)),
-            csr=(
-                local.indptr.astype(PETSc.IntType),
-                (local.indices + first).astype(PETSc.IntType),
-                local.data,
-            ),
-            comm=self._comm,
-        )
+        return sparse_matrix(self._comm, m * d, local.indptr, local.indices + first, local.data)
 
     def _pieces(self, u: fem.Function | None, away: Array) -> tuple[Any, Any, Array, Array, Array]:
         """Cut the facets of Γc along the opposite ones: points with weights on the pieces.

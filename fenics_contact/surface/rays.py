@@ -16,6 +16,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from fenics_contact.compat import sparse_matrix
 from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import gather_rows
 from fenics_contact.surface.bodies import connected_bodies
@@ -376,12 +377,6 @@ def interpolation_matrix(
     filled[rows] = nodes.shape[1]
     columns = nodes[order][:, None, :] * bs + np.arange(d)[None, :, None]
     values = np.broadcast_to(weights[order][:, None, :], columns.shape)
-    return PETSc.Mat().createAIJ(
-        ((n * d, None), (space.dofmap.index_map.size_local * bs, None)),
-        csr=(
-            np.concatenate([[0], np.cumsum(np.repeat(filled, d))]).astype(PETSc.IntType),
-            columns.ravel().astype(PETSc.IntType),
-            values.ravel(),
-        ),
-        comm=space.mesh.comm,
-    )
+    pointers = np.concatenate([[0], np.cumsum(np.repeat(filled, d))])
+    n_columns = space.dofmap.index_map.size_local * bs
+    return sparse_matrix(space.mesh.comm, n_columns, pointers, columns.ravel(), values.ravel())

@@ -17,6 +17,7 @@ import scipy.linalg
 import scipy.sparse
 from petsc4py import PETSc
 
+from fenics_contact.compat import sparse_matrix
 from fenics_contact.systems.substructure import SINGULAR, Substructure
 from fenics_contact.types import Array, Index, Indices, Mask
 
@@ -225,9 +226,8 @@ class Dissection:
             (size, size),
         )
         own.sort_indices()
-        csr = (own.indptr.astype(PETSc.IntType), own.indices.astype(PETSc.IntType), own.data)
         made = Substructure(
-            PETSc.Mat().createAIJ((size, size), csr=csr, comm=PETSc.COMM_SELF),
+            sparse_matrix(PETSc.COMM_SELF, size, own.indptr, own.indices, own.data),
             np.arange(n, size, dtype=np.int32),
             symmetric=self._symmetric,
             prefix=self._prefix,

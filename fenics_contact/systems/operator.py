@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 from petsc4py import PETSc
 
+from fenics_contact.compat import sparse_matrix
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.point_law import PointTangent
 from fenics_contact.parallel import global_sum
@@ -102,15 +103,9 @@ class ContactOperator:
         n, components = contact.quadrature.n_points, list(contact.free_motion)
         counts = np.tile(np.isin(np.arange(d), components), n)
         columns = np.tile(self._first + np.arange(len(components)), n)
-        return PETSc.Mat().createAIJ(
-            ((n * d, None), (self.unknowns.n_local, None)),
-            csr=(
-                np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType),
-                columns.astype(PETSc.IntType),
-                np.ones(columns.size),
-            ),
-            comm=contact.surface.mesh.comm,
-        )
+        pointers = np.concatenate([[0], np.cumsum(counts)])
+        ones = np.ones(columns.size)
+        return sparse_matrix(self.unknowns.comm, self.unknowns.n_local, pointers, columns, ones)
 
     @cached_property
     def touched(self) -> Indices:
@@ -133,8 +128,8 @@ class ContactOperator:
     def _coupled(self, matrix: PETSc.Mat, rows: Array | Mask) -> Indices:
         """Columns of a matrix with an entry in chosen rows, and the angle. Collective."""
         pointers, columns, values = matrix.getValuesCSR()
-        csr = (pointers, columns, (values != 0.0).astype(np.float64))
-        marks = PETSc.Mat().createAIJ(matrix.getSizes(), csr=csr, comm=matrix.comm)
+        there = (values != 0.0).astype(np.float64)
+        marks = sparse_matrix(matrix.comm, matrix.getLocalSize()[1], pointers, columns, there)
         points, counts = marks.createVecLeft(), marks.createVecRight()
         points.array[:] = rows
         marks.multTranspose(points, counts)
@@ -258,17 +253,9 @@ class ContactOperator:
 
     def _one_column(self, n_rows: int, column: int, filled: Indices, values: Array) -> PETSc.Mat:
         """A matrix with values in one column alone, in some of this rank's rows, ascending."""
-        counts = np.zeros(n_rows, dtype=PETSc.IntType)
-        counts[filled] = 1
-        return PETSc.Mat().createAIJ(
-            ((n_rows, None), (self.unknowns.n_local, None)),
-            csr=(
-                np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType),
-                np.full(len(values), column, dtype=PETSc.IntType),
-                values,
-            ),
-            comm=self.contact.surface.mesh.comm,
-        )
+        pointers = np.searchsorted(filled, np.arange(n_rows + 1))
+        columns, unknowns = np.full(len(values), column), self.unknowns
+        return sparse_matrix(unknowns.comm, unknowns.n_local, pointers, columns, values)
 
     def _add_spin(self, product: PETSc.Mat, spun: Array, column: int) -> None:
         """Add to DᵀBD that tractions turn with the obstacle, and arms move. Collective.
@@ -321,17 +308,9 @@ class ContactOperator:
         there = np.any(blocks != 0.0, axis=(1, 2))
         columns = first + d * np.flatnonzero(there)[:, None, None] + np.arange(d)[None, None, :]
         columns = np.broadcast_to(columns, (len(columns), d, d))
-        size = over.getSizes()[0]
         pointers = np.insert(np.cumsum(np.repeat(d * there, d)), 0, 0)
-        return PETSc.Mat().createAIJ(
-            (size, size),
-            csr=(
-                pointers.astype(PETSc.IntType),
-                columns.ravel().astype(PETSc.IntType),
-                blocks[there].ravel(),
-            ),
-            comm=self.contact.surface.mesh.comm,
-        )
+        n_rows, entries = over.getLocalSize()[0], blocks[there].ravel()
+        return sparse_matrix(self.unknowns.comm, n_rows, pointers, columns.ravel(), entries)
 
 
 def _without_zeros(matrix: PETSc.Mat) -> PETSc.Mat:
@@ -341,6 +320,5 @@ def _without_zeros(matrix: PETSc.Mat) -> PETSc.Mat:
     """
     pointers, columns, values = matrix.getValuesCSR()
     there = values != 0.0
-    counts = np.append(0, np.cumsum(there))[pointers].astype(PETSc.IntType)
-    csr = counts, columns[there], values[there]
-    return PETSc.Mat().createAIJ(matrix.getSizes(), csr=csr, comm=matrix.comm)
+    pointers, n_columns = np.append(0, np.cumsum(there))[pointers], matrix.getLocalSize()[1]
+    return sparse_matrix(matrix.comm, n_columns, pointers, columns[there], values[there])

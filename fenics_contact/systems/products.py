@@ -6,6 +6,7 @@ import numpy as np
 import scipy.sparse
 from petsc4py import PETSc
 
+from fenics_contact.compat import sparse_matrix
 from fenics_contact.types import Array
 
 __all__ = ["PointProduct"]
@@ -56,8 +57,8 @@ class PointProduct:
         self._counts = [share.size for share in shares]
         entries, self._entry = np.unique(np.concatenate(shares), return_inverse=True)
         counts = np.bincount(entries // n, minlength=self._rows)
-        self._pointers = np.concatenate([[0], np.cumsum(counts)]).astype(PETSc.IntType)
-        self._columns = (entries % n).astype(PETSc.IntType)
+        self._pointers = np.concatenate([[0], np.cumsum(counts)])
+        self._columns = entries % n
 
     def __call__(self, blocks: Array) -> PETSc.Mat:
         """The product, a new matrix (n, n), for blocks (n_points, gdim, gdim). Collective."""
@@ -66,7 +67,4 @@ class PointProduct:
             parts = np.zeros(self._entry.size)
             self._comm.Gatherv(values, (parts, self._counts))
             values = np.bincount(self._entry, parts, minlength=self._columns.size)
-        size = (self._rows, None)
-        return PETSc.Mat().createAIJ(
-            (size, size), csr=(self._pointers, self._columns, values), comm=self._comm
-        )
+        return sparse_matrix(self._comm, self._rows, self._pointers, self._columns, values)

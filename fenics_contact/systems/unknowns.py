@@ -11,6 +11,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
+from fenics_contact.compat import sparse_matrix
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Selection", "Unknowns"]
@@ -85,19 +86,13 @@ class Unknowns:
         if self.n_motions == 0:
             return matrix
         pointers, columns, values = matrix.getValuesCSR()
-        n_rows = matrix.getLocalSize()[0]
         if rows:
             added = self.n_local - self.n_dofs
             more = np.arange(added, dtype=columns.dtype)
             pointers = np.append(pointers, pointers[-1] + 1 + more)
             columns = np.append(columns, self.first_motion + more)
             values = np.append(values, np.zeros(added))
-            n_rows += added
-        return PETSc.Mat().createAIJ(
-            ((n_rows, None), (self.n_local, None)),
-            csr=(pointers, columns, values),
-            comm=self.comm,
-        )
+        return sparse_matrix(self.comm, self.n_local, pointers, columns, values)
 
 
 class Selection(Unknowns):
@@ -165,10 +160,5 @@ class Selection(Unknowns):
             raise NotImplementedError("rows of a selection")
         pointers, columns, values = matrix.getValuesCSR()
         position, found = self._found(columns)
-        pointers = np.concatenate([[0], np.cumsum(found)])[pointers].astype(PETSc.IntType)
-        n_rows = matrix.getLocalSize()[0]
-        return PETSc.Mat().createAIJ(
-            ((n_rows, None), (self.n_local, None)),
-            csr=(pointers, position[found].astype(PETSc.IntType), values[found]),
-            comm=self.comm,
-        )
+        pointers = np.concatenate([[0], np.cumsum(found)])[pointers]
+        return sparse_matrix(self.comm, self.n_local, pointers, position[found], values[found])
