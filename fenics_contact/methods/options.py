@@ -9,8 +9,9 @@ from __future__ import annotations
 import logging
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Any
 
 from mpi4py import MPI
@@ -40,27 +41,17 @@ def take_command_line(prefix: str, comm: MPI.Comm) -> None:
     """
     database = PETSc.Options()
     arguments = comm.bcast(getattr(sys, "argv", [])[1:])
-    for name, value in _options(arguments).items():
-        mine = prefix and name.startswith(prefix) and name != prefix
+    # Of equal names the last one counts, and is found first here.
+    for argument, following in reversed(list(pairwise([*arguments, None]))):
+        name = argument.removeprefix("-").removeprefix("-")
+        mine = prefix and _is_option(argument) and name.startswith(prefix) and name != prefix
         if mine and not database.hasName(name):
-            database.setValue(name, value)
-
-
-def _options(arguments: Sequence[str]) -> dict[str, str | None]:
-    """Options without dashes and their values, told apart as PETSc does; of equals the last."""
-    found: dict[str, str | None] = {}
-    name = None
-    for argument in arguments:
-        if _is_option(argument):
-            name = argument.removeprefix("-").removeprefix("-")
-            found[name] = None
-        elif name is not None:
-            found[name] = argument
-            name = None
-    return found
+            has_value = following is not None and not _is_option(following)
+            database.setValue(name, following if has_value else None)
 
 
 def _is_option(argument: str) -> bool:
+    """Whether it is the name of an option and no value, told apart as PETSc does."""
     if not re.match("--?[A-Za-z]", argument):
         return False
     try:
