@@ -198,10 +198,6 @@ class _Minimisation(SnesMethod):
         super().__init__(tools.equations, snes, lambda: False, own_solver=own)
         self.goal = 0.0
 
-    def solve(self) -> tuple[int, int]:
-        """See `Method.solve`."""
-        return self._callbacks.solve(self.snes, self._equations.solution)
-
     def converged(self) -> int:
         """See `SnesMethod.converged`."""
         equations = self._equations

@@ -29,6 +29,8 @@ _WHOLE = 0.9
 # Iterations without a lower residual, see `ActiveSetMonitor.idle`, after which another method takes
 # over.
 _PATIENCE = 14
+# What shows how a solver fares; under the problem's own prefix it is for those inside, too.
+_MONITORS = ("snes_monitor", "snes_linesearch_monitor", "snes_converged_reason", "ksp_monitor")
 
 _REASONS = PETSc.SNES.ConvergedReason
 
@@ -94,9 +96,14 @@ class Tools:
             with_own: More of them where the linear solver is its own.
         """
         solver = self.linear_solver(self.equations.symmetric(consistent))
-        every = {**options, **solver, **((with_own or {}) if solver else {})}
-        comm = self.equations.full.unknowns.comm
-        return self.defaults.make_snes(comm, self.prefix, part, every), bool(solver)
+        prefix, defaults = self.prefix + part, self.defaults
+        snes = PETSc.SNES().create(self.equations.full.unknowns.comm)
+        snes.setOptionsPrefix(prefix)
+        defaults.set({**options, **solver, **((with_own or {}) if solver else {})}, prefix)
+        monitors = {name: defaults.get(self.prefix + name) for name in _MONITORS}
+        defaults.set({k: v for k, v in monitors.items() if v is not None}, prefix)
+        defaults.let_read(snes)
+        return snes, bool(solver)
 
 
 class OwnMethod(Method):
@@ -200,6 +207,10 @@ class SnesMethod(Method):
 
     def _compute_jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
         self._equations.assemble_tangent(x, J)
+
+    def solve(self) -> tuple[int, int]:
+        """See `Method.solve`."""
+        return self._callbacks.solve(self.snes, self._equations.solution)
 
     def converged(self) -> int:
         """Why SNES ends here, or that it goes on, as SNES has it."""
@@ -332,7 +343,7 @@ class Newton(SnesMethod):
         """See `Method.solve`."""
         self._iterate = self._trial = None
         self._looks_ahead = self._equations.full.bulk.linear
-        iterations, reason = self._callbacks.solve(self.snes, self._equations.solution)
+        iterations, reason = super().solve()
         # The line search `cp`, by option, takes a step across the residual, F·y = 0, for the end.
         if reason == _REASONS.CONVERGED_FNORM_ABS:
             reason = int(_REASONS.DIVERGED_LINE_SEARCH)

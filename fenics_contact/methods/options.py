@@ -23,8 +23,6 @@ __all__ = ["Defaults", "take_command_line"]
 
 logger = logging.getLogger("fenics_contact")
 
-# What shows how a solver fares; under the problem's own prefix it is for those inside, too.
-_MONITORS = ("snes_monitor", "snes_linesearch_monitor", "snes_converged_reason", "ksp_monitor")
 # Read when something is factored, set up or done; in the first solve that may not be.
 _READ_LATE = re.compile("view|converged_reason|mat_|mg_|gamg|interior_")
 
@@ -112,25 +110,6 @@ class Defaults:
         """The value that holds for a name with prefix; None if there is none."""
         database = PETSc.Options()
         return database.getString(name) if database.hasName(name) else self._values.get(name)
-
-    def make_snes(
-        self, comm: Any, prefix: str, part: str, options: Mapping[str, Any]
-    ) -> PETSc.SNES:
-        """A solver inside another one, with options where nothing has set them. Collective.
-
-        Args:
-            comm: The ranks.
-            prefix: That of the other solver, whose monitors are this one's, too.
-            part: What follows it in the prefix of this one.
-            options: Without prefix.
-        """
-        snes = PETSc.SNES().create(comm)
-        snes.setOptionsPrefix(prefix + part)
-        self.set(options, prefix + part)
-        monitors = {name: self.get(prefix + name) for name in _MONITORS}
-        self.set({k: v for k, v in monitors.items() if v is not None}, prefix + part)
-        self.let_read(snes)
-        return snes
 
     def let_read(self, solver: PETSc.SNES | PETSc.KSP) -> None:
         """Let a solver take the options of its prefix. Collective.

@@ -114,7 +114,7 @@ class _MixedNewton(SnesMethod):
         """See `Method.solve`."""
         self._points = []
         try:
-            return self._callbacks.solve(self.snes, self._equations.solution)
+            return super().solve()
         finally:
             self._points = []
 

@@ -169,7 +169,6 @@ class Solver:
         self.condensed = False
         self.method = settings.method or "lbfgs"
         self.methods: dict[str, OwnMethod] = {}
-        self._quasi_newton, self._factors = True, False
         self.snes: PETSc.SNES
         self.main: SnesMethod
         take_command_line(settings.prefix, self._comm)
@@ -237,7 +236,6 @@ class Solver:
         this: Solver = weakref.proxy(self)  # SNES would keep what keeps it
         main = QuasiNewton if quasi_newton else Newton
         self.main = main(equations, snes, lambda: this.may_go_on())
-        self._quasi_newton, self._factors = quasi_newton, snes_type in _NEWTONS
         self._forget_matrices()
         self.main.attach(consistent=not quasi_newton)
         options.let_read(snes)
@@ -417,7 +415,7 @@ class Solver:
         """New matrices for new couplings, or to forget all that was factored. Collective."""
         self.snes.reset()
         self._forget_matrices()
-        self.main.attach(consistent=not self._quasi_newton)
+        self.main.attach(consistent=not isinstance(self.main, QuasiNewton))
 
     def _forget_matrices(self) -> None:
         self.equations.forget_matrices()
@@ -491,7 +489,8 @@ class Solver:
                 logger.info("%s", attempts[-1])
         equations.set_state(equations.solution)
         own = self.methods.get(method)
-        newton = (self._factors if own is None else own.by_newton) and not self._quasi_newton
+        newton = self.snes.getType() in _NEWTONS if own is None else own.by_newton
+        newton = newton and not isinstance(self.main, QuasiNewton)
         made = sum(attempt.iterations for attempt in attempts[-1:])
         if reason > 0 and newton and (factored or made > 0):
             # With a linear bulk a start by the tangent comes first even where it is far off, which
