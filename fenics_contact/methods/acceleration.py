@@ -28,15 +28,14 @@ _DEPTH, _DISTINCT = 6, 1e-12
 
 
 class Acceleration:
-    """Augments the contacts of a problem in one increment."""
+    """Augments the contacts of a problem in one increment.
+
+    Args:
+        contacts: All contacts of the problem.
+        scales: Of their bodies.
+    """
 
     def __init__(self, contacts: Sequence[Contact], scales: ReferenceScales) -> None:
-        """Nothing has been augmented yet.
-
-        Args:
-            contacts: All contacts of the problem.
-            scales: Of their bodies.
-        """
         found = [(n, c, c.multipliers) for n, c in enumerate(contacts) if c.multipliers is not None]
         self._augmented = [(contact, multipliers) for _, contact, multipliers in found]
         self._group = np.concatenate([scales.group_of_points(number) for number, *_ in found])

@@ -28,7 +28,6 @@ class ActiveSetMonitor:
     """
 
     def __init__(self, contacts: Sequence[Contact]) -> None:
-        """Take the contacts to look at."""
         self._contacts = contacts
         n = sum(c.quadrature.n_points for c in contacts)
         self.idle = self._since = 0  # the latter with those of its present fall

@@ -74,7 +74,6 @@ class Alternation(OwnMethod):
     """
 
     def __init__(self, tools: Tools) -> None:
-        """Set up SNES; the matrices are those of H₀. Collective."""
         self._equations = tools.equations
         self._search = _Search(tools, "alternating_", _OPTIONS)
         self._finish = _Minimisation(tools, "finishing_", _FINISH)
@@ -182,18 +181,18 @@ class Alternation(OwnMethod):
 class _Minimisation(SnesMethod):
     """Newton's method for the problems that are solved one after another, with the matrix of H₀.
 
+    The constructor is collective.
+
+    Args:
+        tools: What it is made of.
+        part: What follows the prefix of the problem's options in that of this one.
+        options: Those of SNES.
+
     Attributes:
         goal: Residual to which the present one is solved (force).
     """
 
     def __init__(self, tools: Tools, part: str, options: Mapping[str, Any]) -> None:
-        """Make its SNES. Collective.
-
-        Args:
-            tools: What it is made of.
-            part: What follows the prefix of the problem's options in that of this one.
-            options: Those of SNES.
-        """
         snes, own = tools.snes(part, options, consistent=False)
         super().__init__(tools.equations, snes, lambda: False, own_solver=own)
         self.goal = 0.0
@@ -221,7 +220,6 @@ class _Search(_Minimisation):
     """The same with a line search on the energy, where the bulk has one."""
 
     def __init__(self, tools: Tools, part: str, options: Mapping[str, Any]) -> None:
-        """See `_Minimisation`."""
         super().__init__(tools, part, options)
         # Potential at the state asked for last, and where it was last found to have fallen.
         self._energy = self._reached = np.inf

@@ -64,14 +64,13 @@ def release_interrupt() -> None:
 
 
 class Callbacks:
-    """The callbacks of one SNES, which is no part of it: SNES keeps them, and would keep itself."""
+    """The callbacks of one SNES, which is no part of it: SNES keeps them, and would keep itself.
+
+    Args:
+        comm: The ranks of the SNES.
+    """
 
     def __init__(self, comm: MPI.Comm) -> None:
-        """No error yet.
-
-        Args:
-            comm: The ranks of the SNES.
-        """
         self._comm = comm
         self._error: BaseException | None = None
         # Where the residual was computed last, and it.

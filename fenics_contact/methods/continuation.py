@@ -46,7 +46,6 @@ class Continuation(OwnMethod):
     """
 
     def __init__(self, tools: Tools) -> None:
-        """Set up SNES; the matrix is that of the consistent tangent. Collective."""
         self._equations = tools.equations
         self._newton = tools.newton("continuation_", {"snes_max_it": _PATIENCE})
         self._newton.most_halvings = _HALVINGS

@@ -38,6 +38,10 @@ _LEAST_SHARE = 1e-6
 class Equations:
     """Residual, energy and matrices at a state that a method asks for.
 
+    Args:
+        alpha: Share of the normal stiffness in H₀.
+        phi: Share of the tangential stiffness of sticking points in H₀.
+
     Attributes:
         full: The system on all unknowns.
         system: The one that is iterated on, `full` or one condensed.
@@ -70,14 +74,6 @@ class Equations:
     def __init__(
         self, full: FullSystem, motions: RigidBodyModes, *, alpha: float, phi: float
     ) -> None:
-        """Nothing is assembled yet.
-
-        Args:
-            full: The system on all unknowns.
-            motions: Rigid motions of the bodies.
-            alpha: Share of the normal stiffness in H₀.
-            phi: Share of the tangential stiffness of sticking points in H₀.
-        """
         self.full, self.motions, self.contacts = full, motions, full.contacts
         self.length = full.scales.mesh_size
         self._bulk, self._comm = full.bulk, full.unknowns.comm

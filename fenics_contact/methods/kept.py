@@ -24,7 +24,11 @@ class Kept:
     """The unknowns that are kept.
 
     All that contact touches, if that is little; else those where bodies are nearest to each other,
-    and more where it turns out that contact spreads beyond them.
+    and more where it turns out that contact spreads beyond them. The constructor is collective.
+
+    Args:
+        full: The system on all unknowns.
+        all_that_pay: Whether to keep however many there are, since the caller says so.
 
     Attributes:
         indices: This rank's, ascending.
@@ -32,12 +36,6 @@ class Kept:
     """
 
     def __init__(self, full: FullSystem, *, all_that_pay: bool) -> None:
-        """Choose them at the present state. Collective.
-
-        Args:
-            full: The system on all unknowns.
-            all_that_pay: Whether to keep however many there are, since the caller says so.
-        """
         self._full, self._all_that_pay = full, all_that_pay
         self.indices = self._nearest()
         self.chosen = False

@@ -143,6 +143,10 @@ class OwnMethod(Method):
 class SnesMethod(Method):
     """A method on a SNES: the main one, whose options are the user's, or one of another method.
 
+    Args:
+        equations: What to solve.
+        own_solver: Whether SNES keeps its own linear solver, not that of the matrix.
+
     Attributes:
         snes: The solver.
         gives_up: Whether to stop where the residual does not fall any more.
@@ -157,14 +161,6 @@ class SnesMethod(Method):
         *,
         own_solver: bool = False,
     ) -> None:
-        """Take the solver; `attach` gives it the equations.
-
-        Args:
-            equations: What to solve.
-            snes: By what.
-            gives_up: See the attribute.
-            own_solver: Whether SNES keeps its own linear solver, not that of the matrix.
-        """
         self.snes, self.gives_up, self.coarse = snes, gives_up, 0.0
         self._own_solver = own_solver
         self._function: PETSc.Vec | None = None  # of the system it is attached to
@@ -238,7 +234,6 @@ class Newton(SnesMethod):
         *,
         own_solver: bool = False,
     ) -> None:
-        """See `SnesMethod`."""
         super().__init__(equations, snes, gives_up, own_solver=own_solver)
         self._iterate: tuple[PETSc.Vec, PETSc.Vec] | None = None  # and the residual there
         self._step: float | None = None  # norm of the correction there, once it is asked for

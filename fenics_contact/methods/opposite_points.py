@@ -61,20 +61,18 @@ class _Pairing:
 class OppositePoints:
     """The iteration for the pairs of an increment.
 
+    Args:
+        full: The system on all unknowns.
+        contacts: Of the problem, all or none.
+
     Attributes:
-        contacts: Those whose pairs may be found anew.
+        contacts: Those of them whose pairs may be found anew.
         predicted: Whether the first pairs are predicted ones.
         end: The state in which the increment ended between the pairs before; None: it is not solved
             yet.
     """
 
     def __init__(self, full: FullSystem, contacts: Sequence[Contact]) -> None:
-        """Begin with the pairs of the committed state.
-
-        Args:
-            full: The system on all unknowns.
-            contacts: Of the problem, all or none.
-        """
         self.end: Array | None = None
         self.predicted = False
         self._full = full

@@ -67,7 +67,6 @@ class Defaults:
     """
 
     def __init__(self) -> None:
-        """None yet."""
         self._values: dict[str, Any] = {}
         self._given: set[str] = set()  # by the caller
         self._unread: set[str] = set()  # of those

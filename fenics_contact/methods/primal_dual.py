@@ -68,7 +68,6 @@ class PrimalDual(OwnMethod):
     by_newton = True
 
     def __init__(self, tools: Tools) -> None:
-        """Set up SNES; the matrix is that of the consistent tangent. Collective."""
         equations = self._equations = tools.equations
         self.snes, own = tools.snes("primal_dual_", _OPTIONS, with_own=_ITERATED)
         self._newton = _MixedNewton(equations, self.snes, own_solver=own)
@@ -103,7 +102,6 @@ class _MixedNewton(SnesMethod):
     """Newton's method on displacements and tractions."""
 
     def __init__(self, equations: Equations, snes: PETSc.SNES, *, own_solver: bool) -> None:
-        """See `SnesMethod`; there are no tractions yet."""
         super().__init__(equations, snes, lambda: False, own_solver=own_solver)
         self._points: list[_Points] = []
         self._share = 1.0  # c, by the stiffness of the law

@@ -35,7 +35,6 @@ class QuasiNewton(SnesMethod):
     def __init__(
         self, equations: Equations, snes: PETSc.SNES, gives_up: Callable[[], bool]
     ) -> None:
-        """No H₀ yet; see `SnesMethod`."""
         super().__init__(equations, snes, gives_up)
         self._limit: int | None = None
         self._refreshed = False

@@ -133,6 +133,13 @@ class Settings:
 class Solver:
     """Solves the equations of an increment by one method, and by others where that fails.
 
+    The constructor is collective.
+
+    Args:
+        full: The system on all unknowns.
+        motions: Rigid motions of the bodies.
+        settings: What the caller says.
+
     Attributes:
         snes: The main SNES, with the user's options.
         equations: What is solved.
@@ -146,13 +153,6 @@ class Solver:
     """
 
     def __init__(self, full: FullSystem, motions: RigidBodyModes, settings: Settings) -> None:
-        """Choose system and method. Collective.
-
-        Args:
-            full: The system on all unknowns.
-            motions: Rigid motions of the bodies.
-            settings: What the caller says.
-        """
         self.equations = Equations(full, motions, alpha=settings.alpha, phi=settings.phi)
         self.expected_increments = _EXPECTED
         self.starts = Starts(self.equations)

@@ -50,7 +50,6 @@ class Starts:
     """
 
     def __init__(self, equations: Equations) -> None:
-        """Nothing is known yet."""
         self.factored = self.predict = False
         self.expected: Array | None = None
         self.change: Array | None = None

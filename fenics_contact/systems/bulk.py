@@ -36,7 +36,7 @@ _OF_ONE = (
 
 
 class Bulk:
-    """The bulk residual F(u; v), without contact.
+    """The bulk residual F(u; v), without contact. The constructor is collective.
 
     Attributes:
         form: The residual, UFL, with one object of tags for each kind of measure.
@@ -51,18 +51,12 @@ class Bulk:
         stiffness: The tangent without Dirichlet conditions, valid after `update`.
         scale: Largest entry on the tangent's diagonal, the unit of stiffness (force/length); of a
             nonlinear bulk on that of the first tangent, so that it is one unit all the way.
+
+    Raises:
+        ValueError: ``form`` is no residual in the space of ``u``.
     """
 
     def __init__(self, form: ufl.Form, displacement: Displacement) -> None:
-        """Differentiate and compile. Collective.
-
-        Args:
-            form: The residual.
-            displacement: In what is solved for.
-
-        Raises:
-            ValueError: ``form`` is no residual in the space of ``u``.
-        """
         u = displacement.whole
         if not isinstance(form, ufl.Form):
             raise ValueError(
@@ -369,11 +363,10 @@ class _Volumes:
 
     The vertices of the cell are among them. There det(I + grad u) of bilinear displacements, which
     varies linearly over a straight quadrilateral, is extreme; points inside alone, as those of a
-    Gauss rule, do not show a corner that is turned inside out.
+    Gauss rule, do not show a corner that is turned inside out. The constructor is collective.
     """
 
     def __init__(self, displacement: Displacement) -> None:
-        """Compile. Collective."""
         u, mesh = displacement.expression, displacement.u.function_space.mesh
         cell = mesh.basix_cell()
         points = basix.create_lattice(
@@ -407,11 +400,11 @@ def _branches_by(form: ufl.Form, u: fem.Function) -> bool:
 class _Part:
     """The integrals of F of one kind: over cells, over exterior facets ...
 
-    Taken apart no further but by rules, so that every integral keeps the one that it has in F.
+    Taken apart no further but by rules, so that every integral keeps the one that it has in F. The
+    constructor is collective.
     """
 
     def __init__(self, form: ufl.Form, kind: str, u: fem.Function) -> None:
-        """Compile. Collective."""
         mine = ufl.Form([i for i in form.integrals() if i.integral_type() == kind])
         self.empty = ufl.algorithms.expand_derivatives(mine).empty()  # a load that is 0 in UFL
         still = ufl.replace(mine, {u: ufl.zero(u.ufl_shape)})

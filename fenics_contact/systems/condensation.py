@@ -35,13 +35,26 @@ _DIRECTIONS = 4
 class Condensation:
     """A stiffness with all but some of its unknowns eliminated.
 
-    Prescribed unknowns that are not kept are held at the values they have.
+    Prescribed unknowns that are not kept are held at the values they have. The constructor is
+    collective.
+
+    Args:
+        stiffness: Over all unknowns, without conditions.
+        bulk: The form that it is of.
+        unknowns: The unknowns to keep.
+        constrained: Mask of the prescribed unknowns among all of this rank, (n_local,).
+        prefix: Of the options of the factorisation.
+        label: Body of every unknown of this rank, (n_local,); by default there is one body.
 
     Attributes:
         schur: The condensed stiffness, (n_kept, n_kept) on the first rank, Fortran order
             (force/length).
         response: What the load of `set_load` makes of the body with the unknowns kept at rest.
         directions: Loads that were solved for, scaled, and what they make of it.
+
+    Raises:
+        RuntimeError: The stiffness is singular even with the kept unknowns held.
+        MemoryError: There is not enough.
     """
 
     def __init__(
@@ -54,20 +67,6 @@ class Condensation:
         prefix: str = "",
         label: Labels | None = None,
     ) -> None:
-        """Factor. Collective.
-
-        Args:
-            stiffness: Over all unknowns, without conditions.
-            bulk: The form that it is of.
-            unknowns: The unknowns to keep.
-            constrained: Mask of the prescribed unknowns among all of this rank, (n_local,).
-            prefix: Of the options of the factorisation.
-            label: Body of every unknown of this rank, (n_local,); by default there is one body.
-
-        Raises:
-            RuntimeError: The stiffness is singular even with the kept unknowns held.
-            MemoryError: There is not enough.
-        """
         self._stiffness, self._unknowns, self._comm = stiffness, unknowns, unknowns.comm
         outside = np.ones(constrained.size, dtype=np.bool_)
         outside[unknowns.kept] = False

@@ -76,7 +76,13 @@ def all_kept(n: int, n_touched: int, dimension: int) -> bool:
 
 
 class CondensedSystem(System):
-    """The unknowns that contact touches, on the first rank; all others are eliminated."""
+    """The unknowns that contact touches, on the first rank; all others are eliminated.
+
+    Args:
+        full: All unknowns of a problem.
+        unknowns: Those that contact touches, or may touch in this increment.
+        prefix: Of the options of the factorisation.
+    """
 
     unknowns: Selection
     # A dense factorisation costs no more than ten iterations. With fewer in a round L-BFGS is
@@ -84,13 +90,6 @@ class CondensedSystem(System):
     iterations_per_round = 8
 
     def __init__(self, full: FullSystem, unknowns: Selection, *, prefix: str = "") -> None:
-        """Select. Collective.
-
-        Args:
-            full: All unknowns of a problem.
-            unknowns: Those that contact touches, or may touch in this increment.
-            prefix: Of the options of the factorisation.
-        """
         kept = unknowns.kept
         super().__init__(
             full.u,

@@ -33,7 +33,6 @@ class Sum:
     """
 
     def __init__(self) -> None:
-        """Nothing yet; see `set_parts`."""
         self.error: BaseException | None = None
         self.fixed: Array = np.zeros((0, 0))
         nothing = np.zeros(0, dtype=np.intp)
@@ -86,7 +85,6 @@ class UpdatedLU:
     """
 
     def __init__(self) -> None:
-        """Nothing is factored yet."""
         self.error: BaseException | None = None
         self._operator = Sum()
         nothing: Array = np.zeros((0, 0))

@@ -45,19 +45,17 @@ class Eliminated:
 
     By Cholesky's factors L Lᵀ where it is symmetric and positive definite, which it need not be,
     and by LU otherwise.
+
+    Args:
+        matrix: Fortran order, those to be eliminated first; used.
+        n: Their number.
+        symmetric: Whether it is.
+
+    Raises:
+        RuntimeError: It is singular there.
     """
 
     def __init__(self, matrix: Array, n: int, *, symmetric: bool) -> None:
-        """Factor.
-
-        Args:
-            matrix: Fortran order, those to be eliminated first; used.
-            n: Their number.
-            symmetric: Whether it is.
-
-        Raises:
-            RuntimeError: It is singular there.
-        """
         self._lower: Array | None = None
         self._factors: Any = None
         first, coupling = matrix[:n, :n], matrix[:n, n:]
@@ -131,9 +129,20 @@ class _Step:
 class Dissection:
     """A piece of a body with all but its boundary eliminated. Of this rank alone.
 
+    Args:
+        stiffness: Of this rank alone, (n, n); used.
+        places: Where the unknowns are, (n, gdim).
+        symmetric: Whether the stiffness is.
+        prefix: Of the options of the factorisations.
+        inner: Unknowns in a substructure, about, in three dimensions.
+
     Attributes:
         boundary: Numbers of the unknowns that stay, ascending, (n_boundary,).
         schur: What is left for them, (n_boundary, n_boundary), Fortran order (force/length).
+
+    Raises:
+        RuntimeError: The stiffness is singular even with the boundary held.
+        MemoryError: There is not enough.
     """
 
     def __init__(
@@ -146,20 +155,6 @@ class Dissection:
         prefix: str = "",
         inner: int = _INNER,
     ) -> None:
-        """Eliminate.
-
-        Args:
-            stiffness: Of this rank alone, (n, n); used.
-            boundary: See the attribute.
-            places: Where the unknowns are, (n, gdim).
-            symmetric: Whether the stiffness is.
-            prefix: Of the options of the factorisations.
-            inner: Unknowns in a substructure, about, in three dimensions.
-
-        Raises:
-            RuntimeError: The stiffness is singular even with the boundary held.
-            MemoryError: There is not enough.
-        """
         n, self.boundary = stiffness.getSize()[0], boundary
         self._n, self._symmetric, self._prefix = n, symmetric, prefix
         self._steps: list[_Step] = []  # substructures first, children before parents

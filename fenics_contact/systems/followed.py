@@ -17,18 +17,18 @@ __all__ = ["FollowedModulus"]
 class FollowedModulus:
     """E as it was measured last; contacts to which it was given by their caller are left alone.
 
+    The constructor is collective.
+
+    Args:
+        bulk: The bulk form.
+        displacement: In it.
+        contacts: Of the problem.
+
     Attributes:
         present: One value per cell (stress); None: no contact asks for it.
     """
 
     def __init__(self, bulk: Bulk, displacement: Displacement, contacts: Sequence[Contact]) -> None:
-        """Measure it. Collective.
-
-        Args:
-            bulk: The bulk form.
-            displacement: In it.
-            contacts: Of the problem.
-        """
         self._bulk, self._displacement = bulk, displacement
         self._contacts = [c for c in contacts if c.inputs.needs_modulus]
         self.present: fem.Function | None = None

@@ -48,7 +48,6 @@ class FullSystem(System):
         constrained: Mask,
         bcs: Sequence[fem.DirichletBC],
     ) -> None:
-        """Take over the parts of a problem. Collective."""
         self.bcs = bcs
         u, space = displacement.whole, displacement.u.function_space
         n, body = connected_bodies(space)

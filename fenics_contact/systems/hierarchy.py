@@ -27,7 +27,6 @@ class Hierarchy:
     """
 
     def __init__(self) -> None:
-        """Nothing is set up."""
         self.set_ups = 0
         self._stiffness: tuple[int, int] | None = None  # which one, and how often it was changed
         self._rows: PETSc.IS | None = None

@@ -16,16 +16,14 @@ class PointProduct:
     """DᵀBD for blocks B, one per point: every entry is a sum over fixed places of B.
 
     The unknowns are all on the first rank, the points where they are. What depends on D alone is
-    found once; then a product costs a tenth of PETSc's.
+    found once; then a product costs a tenth of PETSc's. The constructor is collective.
+
+    Args:
+        felt_map: D, from the unknowns to the points, (n_points gdim, n).
+        gdim: Rows of a point.
     """
 
     def __init__(self, felt_map: PETSc.Mat, gdim: int) -> None:
-        """Find which places of B go where. Collective.
-
-        Args:
-            felt_map: D, from the unknowns to the points, (n_points gdim, n).
-            gdim: Rows of a point.
-        """
         self._comm = felt_map.comm.tompi4py()
         pointers, columns, values = felt_map.getValuesCSR()
         self._rows, n = felt_map.getSizes()[1]

@@ -33,7 +33,14 @@ class ReferenceScales:
     """Reference quantities of every body and of every free obstacle, the same on every rank.
 
     Bodies come first, then the obstacles that move freely (together: the parts). Two of them are
-    coupled in an increment if a point of a contact belongs to both.
+    coupled in an increment if a point of a contact belongs to both. The constructor is collective.
+
+    Args:
+        displacement: In what is solved for.
+        body: Body of every node of this rank, ghosts last.
+        moves: Which of these unknowns are displacements or motions, (n_local,).
+        n_motions: Number of free motions of obstacles, each of which is a part.
+        contacts: Of the problem.
 
     Attributes:
         n_bodies: Number of bodies.
@@ -61,16 +68,6 @@ class ReferenceScales:
         n_motions: int,
         contacts: Sequence[Contact],
     ) -> None:
-        """Measure the bodies. Collective.
-
-        Args:
-            displacement: In what is solved for.
-            body: Body of every node of this rank, ghosts last.
-            label: Part of every unknown of this rank, (n_local,).
-            moves: Which of these unknowns are displacements or motions, (n_local,).
-            n_motions: Number of free motions of obstacles, each of which is a part.
-            contacts: Of the problem.
-        """
         space = displacement.u.function_space
         self._comm, self.label, self._moves = space.mesh.comm, label, moves
         n_bodies = self._comm.allreduce(int(body.max(initial=-1)), op=MPI.MAX) + 1

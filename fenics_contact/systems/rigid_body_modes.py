@@ -29,7 +29,6 @@ class RigidBodyModes(RigidMotions):
     """
 
     def __init__(self, full: FullSystem) -> None:
-        """None are free yet; see `RigidMotions`. Collective."""
         super().__init__(full)
         self.free: Array = np.zeros((0, len(self.names)))
         self._jumps: weakref.WeakKeyDictionary[ContactOperator, Array]

@@ -24,7 +24,11 @@ class RigidMotions:
     """Translations and rotations of every body of a mesh, and the free motions of obstacles.
 
     A body is a part of the mesh connected by its displacements. Rotations are about the body's
-    middle and scaled by its size, so that every motion is a displacement of order one.
+    middle and scaled by its size, so that every motion is a displacement of order one. The
+    constructor is collective.
+
+    Args:
+        full: The system. Each free motion of an obstacle is a rigid motion of its own.
 
     Attributes:
         comm: The ranks.
@@ -37,11 +41,6 @@ class RigidMotions:
     """
 
     def __init__(self, full: FullSystem) -> None:
-        """Make the motions at this rank's unknowns. Collective.
-
-        Args:
-            full: The system. Each free motion of an obstacle is a rigid motion of its own.
-        """
         space, unknowns, scales = full.displacement.u.function_space, full.unknowns, full.scales
         n_owned = space.dofmap.index_map.size_local
         x = space.tabulate_dof_coordinates()[:n_owned, : full.gdim]

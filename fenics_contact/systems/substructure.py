@@ -26,26 +26,24 @@ SINGULAR = (
 class Substructure:
     """A stiffness whose inner unknowns are factored. Of this rank alone: nothing is collective.
 
+    Args:
+        stiffness: Of this rank alone, (n, n); used.
+        boundary: Numbers of the unknowns that stay, ascending, (n_boundary,).
+        symmetric: Whether the stiffness is.
+        prefix: Of the options of the factorisation.
+
     Attributes:
         schur: What is left for the boundary, (n_boundary, n_boundary), Fortran order
             (force/length).
+
+    Raises:
+        RuntimeError: The stiffness is singular even with the boundary held.
+        MemoryError: There is not enough.
     """
 
     def __init__(
         self, stiffness: PETSc.Mat, boundary: Indices, *, symmetric: bool, prefix: str = ""
     ) -> None:
-        """Factor.
-
-        Args:
-            stiffness: Of this rank alone, (n, n); used.
-            boundary: Numbers of the unknowns that stay, ascending, (n_boundary,).
-            symmetric: Whether the stiffness is.
-            prefix: Of the options of the factorisation.
-
-        Raises:
-            RuntimeError: The stiffness is singular even with the boundary held.
-            MemoryError: There is not enough.
-        """
         n = stiffness.getSize()[0]
         self._stiffness, self._boundary = stiffness, boundary
         self._inner = np.setdiff1d(np.arange(n), boundary, assume_unique=True)

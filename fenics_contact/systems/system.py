@@ -34,7 +34,7 @@ _TURN = np.pi / 2
 
 
 class System(ABC):
-    """States, forces and matrices over some unknowns of a problem.
+    """States, forces and matrices over some unknowns of a problem. The constructor is collective.
 
     Attributes:
         u: What is solved for.
@@ -70,7 +70,6 @@ class System(ABC):
         label: npt.NDArray[np.intp],
         n_bodies: int,
     ) -> None:
-        """Take over the parts of a problem; see the attributes. Collective."""
         self.u, self.unknowns, self.bulk = u, unknowns, bulk
         self.gdim: int = u.function_space.mesh.geometry.dim
         self.contacts, self.constrained = contacts, constrained

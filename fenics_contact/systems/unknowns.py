@@ -18,7 +18,7 @@ __all__ = ["Selection", "Unknowns"]
 
 
 class Unknowns:
-    """How the unknowns lie on the ranks.
+    """How the unknowns lie on the ranks. The constructor is collective.
 
     Attributes:
         n_dofs: Dofs of the displacement that this rank owns.
@@ -33,7 +33,6 @@ class Unknowns:
     """
 
     def __init__(self, space: fem.FunctionSpace, n_motions: int = 0) -> None:
-        """Count. Collective."""
         dofmap = space.dofmap
         self.comm = space.mesh.comm
         self.whole: Unknowns = self
@@ -98,17 +97,17 @@ class Unknowns:
 class Selection(Unknowns):
     """Some of the dofs and all of the motions, all of them on the first rank.
 
+    The constructor is collective.
+
+    Args:
+        whole: All unknowns.
+        kept: Numbers of the dofs and motions among this rank's, ascending.
+
     Attributes are those of `Unknowns`, and
         numbers: Of these unknowns among all of all ranks, ascending; the same on every rank.
     """
 
     def __init__(self, whole: Unknowns, kept: npt.NDArray[np.int32]) -> None:
-        """Select. Collective.
-
-        Args:
-            whole: All unknowns.
-            kept: Numbers of the dofs and motions among this rank's, ascending.
-        """
         self.whole, self.kept, self.comm = whole, kept, whole.comm
         shares = self.comm.allgather(whole.first + kept.astype(np.int64))
         self._counts = [share.size for share in shares]
