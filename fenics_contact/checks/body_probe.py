@@ -29,7 +29,8 @@ class OpposingBodyProbe:
 
     Attributes:
         x: Where they are on the undeformed surfaces, those of Γc first, (n, gdim) (length).
-        resisted: See `Probe`: on the facets of Γc, and on those opposite.
+        resisted: On the facets of Γc, and on those opposite: corners of facets, (m, n_corners), and
+            the penetration of points there that the law resists, (m,) (length).
         u: The displacement.
     """
 
@@ -103,11 +104,14 @@ class OpposingBodyProbe:
         return hits.completed(lost, side.trace(rays, lost, self.u, np.full(n, np.inf)))
 
     def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
-        """See `Probe`."""
+        """Whether this rank's displacement is that of the last commit."""
         return bool(np.array_equal(self.u.x.array, before.x.array))
 
     def is_valid_for(self, contact: Contact) -> bool:
-        """See `Probe`: by the largest displacements on both surfaces since."""
+        """Whether nothing can be found at the present state that was not there. Collective.
+
+        Both surfaces must have moved less since than they are clear of each other.
+        """
         change = (contact.u.x.array - self.u.x.array).reshape(-1, self.x.shape[1])
         ways = [change[side.side.facets.nodes.ravel()] for side in (self._here, self._there)]
         common = global_mean(self._comm, np.concatenate(ways))
@@ -115,7 +119,7 @@ class OpposingBodyProbe:
         return bool(sum(most) <= self._clear)
 
     def depth(self, resisted: ResistedDepth) -> tuple[Array, Array]:
-        """See `Probe`."""
+        """Penetration at the places, and what is allowed there, (n,) (length). Collective."""
         here, there, hits, back = self._here, self._there, self._hits, self._back
         on = np.concatenate([here.number, back.facet])  # the facet of Γc, of those of all ranks
         opposite = np.concatenate([hits.facet, there.number])
@@ -157,7 +161,7 @@ class OpposingBodyProbe:
         return through, normal
 
     def crossed(self, allowed: Array) -> Array:
-        """See `Probe`.
+        """Find the undeformed places, (n, gdim) (length), that crossed the opposite. Collective.
 
         A place has crossed if it came in through a facet and is deeper than is allowed at the end,
         or has left the body through its opposite side.

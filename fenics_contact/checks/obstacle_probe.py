@@ -160,13 +160,16 @@ class RigidObstacleProbe:
         return facets, references, distances, normals
 
     def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
-        """See `Probe`: by where the points are in the frame of the obstacle."""
+        """Whether points and shape of this rank are those of the last commit, in its frame."""
         committed = contact.values.x + contact.opposite.committed_jump
         is_shape = np.array_equal(self._shape, self.sampler.committed_shape)
         return bool(is_shape and np.array_equal(self.points, committed))
 
     def is_valid_for(self, contact: Contact) -> bool:
-        """See `Probe`: of an obstacle that neither turns nor changes its shape."""
+        """Whether nothing can be found at the present state that was not there. Collective.
+
+        The obstacle must not turn or change its shape, and no place move more than it is clear.
+        """
         known = np.array_equal(self._shape, self.sampler.shape) and not contact.opposite.turns
         moved = self._at(self._in_frame(contact, contact.u)) - self.z
         size = self.places.size[self.facet]
@@ -181,7 +184,7 @@ class RigidObstacleProbe:
         return self.comm.allreduce(int(not known)) == 0
 
     def depth(self, resisted: ResistedDepth) -> tuple[Array, Array]:
-        """See `Probe`."""
+        """Penetration at the places, and what is allowed there, (n,) (length). Collective."""
         places = self.places
         deep = resisted.at(places.facets.corner_vertices())[self.facet]
         planes = depth_below(self._explained, *(p[self.facet] for p in self._planes))

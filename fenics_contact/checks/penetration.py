@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from dolfinx import fem
 from mpi4py import MPI
 
-from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import gather_rows
 from fenics_contact.types import Array, Index
 
@@ -19,7 +17,6 @@ __all__ = [
     "DEPTH_RESOLUTION",
     "OPPOSITE_SIDES",
     "PREDICTED_DEPTH",
-    "Probe",
     "ResistedDepth",
     "allowed_depth",
     "depth_below",
@@ -79,31 +76,6 @@ class ResistedDepth:
         place = np.minimum(np.searchsorted(self.vertices, vertices), len(self.vertices) - 1)
         found = np.where(self.vertices[place] == vertices, self.depth[place], 0.0)
         return np.asarray(found.max(axis=1, initial=0.0))
-
-
-class Probe(Protocol):
-    """Places of the surfaces of a contact where the bodies have moved to.
-
-    Attributes:
-        x: Where they are on the undeformed surfaces, (n, gdim) (length).
-        resisted: Corners of facets of this rank, (m, n_corners), and the penetration of their
-            points that the law resists, (m,) (length).
-    """
-
-    x: Array
-    resisted: list[tuple[Index, Array]]
-
-    def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
-        """Whether this rank's part is of the committed state, whose displacement is before."""
-
-    def is_valid_for(self, contact: Contact) -> bool:
-        """Whether nothing can be found at the present state that was not there. Collective."""
-
-    def depth(self, resisted: ResistedDepth) -> tuple[Array, Array]:
-        """Penetration at the places, and what is allowed there, (n,) (length). Collective."""
-
-    def crossed(self, allowed: Array) -> Array:
-        """Find the undeformed places, (n, gdim) (length), that crossed the opposite. Collective."""
 
 
 def tangent_planes_around(

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from dolfinx import fem
@@ -23,13 +23,15 @@ from mpi4py import MPI
 from fenics_contact.checks.body_probe import OpposingBodyProbe
 from fenics_contact.checks.condition import Condition
 from fenics_contact.checks.obstacle_probe import RigidObstacleProbe
-from fenics_contact.checks.penetration import Probe, ResistedDepth
+from fenics_contact.checks.penetration import ResistedDepth
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import gather_rows
 from fenics_contact.types import Array
 from fenics_contact.wording import place_in_words
 
 __all__ = ["Tunnelling", "TunnellingCheck"]
+
+_Probe: TypeAlias = RigidObstacleProbe | OpposingBodyProbe
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Tunnelling:
     crossed: list[float] | None = None
 
     @classmethod
-    def of(cls, comm: MPI.Comm, probe: Probe, resisted: ResistedDepth) -> Tunnelling:
+    def of(cls, comm: MPI.Comm, probe: _Probe, resisted: ResistedDepth) -> Tunnelling:
         """Judge the places of one contact. Collective.
 
         Args:
@@ -123,7 +125,7 @@ class TunnellingCheck:
             if known is not None and known.is_valid_for(contact):
                 probes[name] = known
                 continue
-            probe: Probe = (
+            probe: _Probe = (
                 RigidObstacleProbe(contact, before, known)
                 if contact.rigid
                 else OpposingBodyProbe(contact, before, known)
