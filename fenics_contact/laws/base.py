@@ -15,7 +15,7 @@ from typing import Any
 import ufl
 
 from fenics_contact.laws.return_maps import positive_part
-from fenics_contact.types import Expr
+from fenics_contact.types import Expr, Values
 
 __all__ = [
     "ContactTraction",
@@ -175,9 +175,7 @@ class Law:
                 "points (stress/length); add one"
             )
 
-    def contact_traction(
-        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
-    ) -> ContactTraction:
+    def contact_traction(self, kinematics: PointKinematics, parameters: Values) -> ContactTraction:
         """Return the tractions at a point.
 
         Args:
@@ -186,14 +184,14 @@ class Law:
         """
         raise NotImplementedError
 
-    def normal_potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
+    def normal_potential(self, kinematics: PointKinematics, parameters: Values) -> Expr:
         """Return the energy per area whose derivative with respect to the gap is r_n.
 
         By default it is ½ k_n ⟨u_n - s⟩₊² [19].
         """
         return signorini_potential(kinematics, parameters["k_n"])
 
-    def normal_stiffness(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
+    def normal_stiffness(self, kinematics: PointKinematics, parameters: Values) -> Expr:
         """Return -∂r_n/∂u_n where the gap is closed (stress/length)."""
         if not self.has_own_normal:
             return parameters["k_n"]
@@ -201,7 +199,7 @@ class Law:
         density = self.normal_potential(replace(kinematics, gap=gap), parameters)
         return ufl.diff(ufl.diff(density, gap), gap)
 
-    def potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
+    def potential(self, kinematics: PointKinematics, parameters: Values) -> Expr:
         """Return the energy per area whose derivative by the jump ⟦u⟧ is minus the traction.
 
         Raises:
@@ -227,7 +225,7 @@ class Law:
         return 0
 
     def friction_bound(
-        self, kinematics: PointKinematics, pressure: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, pressure: Expr, parameters: Values
     ) -> Expr:
         """Return the size of the yield surface under a contact pressure (stress), ≥ 0.
 
@@ -242,32 +240,26 @@ class Law:
         """
         return ufl.as_ufl(0.0)
 
-    def circumradius(self, parameters: Mapping[str, Expr]) -> Expr | None:
+    def circumradius(self, parameters: Values) -> Expr | None:
         """Return the largest |τ| on the yield surface of friction bound 1; None if it is unknown.
 
         If it is unknown, limit analysis does not apply, and no load is refused because of friction.
         """
         return None
 
-    def tangential_stiffness(
-        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
-    ) -> Expr:
+    def tangential_stiffness(self, kinematics: PointKinematics, parameters: Values) -> Expr:
         """Return K_t of a sticking point (stress/length), shape (gdim, gdim), with K_t n = 0."""
         n = kinematics.normal
         return parameters["k_t"] * (ufl.Identity(len(n)) - ufl.outer(n, n))
 
     def elastic_displacement(
-        self, kinematics: PointKinematics, traction: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, traction: Expr, parameters: Values
     ) -> Expr:
         """Return K_t⁻¹ τ = -v_e (length), shape (gdim,), with the elastic displacement v_e [24]."""
         return traction / parameters["k_t"]
 
     def yield_functions(
-        self,
-        kinematics: PointKinematics,
-        traction: Expr,
-        bound: Expr,
-        parameters: Mapping[str, Expr],
+        self, kinematics: PointKinematics, traction: Expr, bound: Expr, parameters: Values
     ) -> tuple[Expr, ...]:
         """Return the yield functions g_j(τ, bound) ≤ 0 of the slip modes (stress) [29].
 
@@ -277,7 +269,7 @@ class Law:
         return ()
 
     def stored(
-        self, kinematics: PointKinematics, response: ContactTraction, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, response: ContactTraction, parameters: Values
     ) -> Expr:
         """Return the elastic energy per area, r_n²/2k_n or `normal_potential`, plus τ·K_t⁻¹τ/2.
 
@@ -298,7 +290,7 @@ class Law:
         return stored
 
     def dissipated(
-        self, kinematics: PointKinematics, response: ContactTraction, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, response: ContactTraction, parameters: Values
     ) -> Expr:
         """Return the frictional dissipation per area, -τ·(Δu_t + K_t⁻¹ Δτ) ≥ 0."""
         assert response.traction is not None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +12,7 @@ from fenics_contact.laws.base import ContactTraction, PointKinematics
 from fenics_contact.laws.friction import FrictionLaw
 from fenics_contact.laws.return_maps import positive_part
 from fenics_contact.laws.stiffness import RelativeStiffness
-from fenics_contact.types import Expr
+from fenics_contact.types import Expr, Values
 
 __all__ = ["NormalCompliance"]
 
@@ -70,9 +69,7 @@ class NormalCompliance(FrictionLaw):
         """Names of the parameters that must be greater than zero: all but friction."""
         return super().positive | {"pressure", "approach", "exponent"}
 
-    def contact_traction(
-        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
-    ) -> ContactTraction:
+    def contact_traction(self, kinematics: PointKinematics, parameters: Values) -> ContactTraction:
         """Return r_n = -p₀ (δ₋/h)^m and τ by eq. (7) with the bound μ p."""
         penetration, opening = positive_part(-kinematics.gap), positive_part(kinematics.gap)
         h, m = parameters["approach"], parameters["exponent"]
@@ -83,7 +80,7 @@ class NormalCompliance(FrictionLaw):
         slip = tuple(ufl.conditional(closed, mode, 0) for mode in slip)
         return ContactTraction(-p, opening, penetration, traction, bound, slip)
 
-    def normal_potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
+    def normal_potential(self, kinematics: PointKinematics, parameters: Values) -> Expr:
         """Return p₀ h (δ₋/h)^(m+1)/(m+1), whose derivative with respect to the gap is r_n."""
         h, m = parameters["approach"], parameters["exponent"]
         penetration = positive_part(-kinematics.gap)

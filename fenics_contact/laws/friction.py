@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from numbers import Integral
 from typing import Any
@@ -25,7 +24,7 @@ from fenics_contact.laws.return_maps import (
     return_to_segment,
 )
 from fenics_contact.laws.stiffness import RelativeStiffness
-from fenics_contact.types import Expr
+from fenics_contact.types import Expr, Values
 
 __all__ = ["Coulomb", "FrictionLaw", "Tresca", "perpendicular"]
 
@@ -122,12 +121,12 @@ class FrictionLaw(Law):
         return 2 if gdim == 2 else self.modes or 1
 
     def friction_bound(
-        self, kinematics: PointKinematics, pressure: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, pressure: Expr, parameters: Values
     ) -> Expr:
         """Return the friction bound μ p (stress)."""
         return parameters["friction"] * pressure
 
-    def circumradius(self, parameters: Mapping[str, Expr]) -> Expr | None:
+    def circumradius(self, parameters: Values) -> Expr | None:
         """Return the largest |τ| on the yield surface of friction bound 1.
 
         It is that of the polygon's vertices, along the larger half-axis; None if a subclass has
@@ -141,7 +140,7 @@ class FrictionLaw(Law):
         ratio = parameters["transverse_friction"] / parameters["friction"]
         return radius * ufl.max_value(1.0, ratio)
 
-    def _frame(self, normal: Expr, parameters: Mapping[str, Expr]) -> tuple[Expr, Expr]:
+    def _frame(self, normal: Expr, parameters: Values) -> tuple[Expr, Expr]:
         """Orthonormal vectors of the tangent plane, the first along the direction.
 
         Without a direction it is that of x, or of y where the normal is nearly along x.
@@ -155,7 +154,7 @@ class FrictionLaw(Law):
         first = first / ufl.sqrt(ufl.dot(first, first))
         return first, ufl.cross(normal, first)
 
-    def _sides(self, normal: Expr, parameters: Mapping[str, Expr]) -> list[tuple[Expr, Expr]]:
+    def _sides(self, normal: Expr, parameters: Values) -> list[tuple[Expr, Expr]]:
         """Of each side of the polygon the outward normal, and the vector along it.
 
         The first side is across the direction.
@@ -168,9 +167,7 @@ class FrictionLaw(Law):
             sides.append((c * first + s * second, -s * first + c * second))
         return sides
 
-    def _stretched(
-        self, vector: Expr, power: int, normal: Expr, parameters: Mapping[str, Expr]
-    ) -> Expr:
+    def _stretched(self, vector: Expr, power: int, normal: Expr, parameters: Values) -> Expr:
         """B to a power, times a tangential vector."""
         if self.transverse_friction is None:
             return vector
@@ -178,9 +175,7 @@ class FrictionLaw(Law):
         ratio = parameters["transverse_friction"] / parameters["friction"]
         return ufl.dot(vector, first) * first + ratio**power * ufl.dot(vector, second) * second
 
-    def tangential_stiffness(
-        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
-    ) -> Expr:
+    def tangential_stiffness(self, kinematics: PointKinematics, parameters: Values) -> Expr:
         """Return K_t = k_t B² of a sticking point (stress/length), shape (gdim, gdim)."""
         if self.transverse_friction is None:
             return super().tangential_stiffness(kinematics, parameters)
@@ -189,17 +184,13 @@ class FrictionLaw(Law):
         return parameters["k_t"] * (ufl.outer(first, first) + ratio**2 * ufl.outer(second, second))
 
     def elastic_displacement(
-        self, kinematics: PointKinematics, traction: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, traction: Expr, parameters: Values
     ) -> Expr:
         """Return the elastic displacement K_t⁻¹ τ = B⁻² τ/k_t (length), shape (gdim,)."""
         return self._stretched(traction, -2, kinematics.normal, parameters) / parameters["k_t"]
 
     def yield_functions(
-        self,
-        kinematics: PointKinematics,
-        traction: Expr,
-        bound: Expr,
-        parameters: Mapping[str, Expr],
+        self, kinematics: PointKinematics, traction: Expr, bound: Expr, parameters: Values
     ) -> tuple[Expr, ...]:
         """Return the yield functions of the slip modes (stress).
 
@@ -216,7 +207,7 @@ class FrictionLaw(Law):
         return tuple(ufl.dot(sigma, a) - bound for a, _ in self._sides(n, parameters))
 
     def _return(
-        self, kinematics: PointKinematics, bound: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, bound: Expr, parameters: Values
     ) -> tuple[Expr, Expr, tuple[Expr, ...]]:
         """Return σ*, σ and Δβ of each mode by the return map in σ, eq. (7)."""
         n, k_t = kinematics.normal, parameters["k_t"]
@@ -231,14 +222,14 @@ class FrictionLaw(Law):
         return trial, sigma, tuple(e / k_t for e in excess)
 
     def return_map(
-        self, kinematics: PointKinematics, bound: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, bound: Expr, parameters: Values
     ) -> tuple[Expr, tuple[Expr, ...]]:
         """Return τ at the end of the increment, shape (gdim,), and Δβ of each mode, eq. (7)."""
         _, sigma, slip = self._return(kinematics, bound, parameters)
         return self._stretched(sigma, 1, kinematics.normal, parameters), slip
 
     def sliding_potential(
-        self, kinematics: PointKinematics, bound: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, bound: Expr, parameters: Values
     ) -> Expr:
         """Return the potential of τ for a given bound, with τ = -∂/∂Δu_t.
 
@@ -261,16 +252,14 @@ class _GivenBound(FrictionLaw):
         """Whether the tractions derive from a potential: always True."""
         return True
 
-    def contact_traction(
-        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
-    ) -> ContactTraction:
+    def contact_traction(self, kinematics: PointKinematics, parameters: Values) -> ContactTraction:
         """Return the tractions of the law, with τ by the given friction bound."""
         bound = parameters["friction_bound"]
         traction, slip = self._law.return_map(kinematics, bound, parameters)
         found = self._law.contact_traction(kinematics, parameters)
         return replace(found, traction=traction, friction_bound=bound, slip=slip)
 
-    def potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
+    def potential(self, kinematics: PointKinematics, parameters: Values) -> Expr:
         """Return the energy per area of the normal tractions and of given friction."""
         normal = self._law.normal_potential(kinematics, parameters)
         bound = parameters["friction_bound"]
@@ -311,9 +300,7 @@ class Coulomb(FrictionLaw):
     transverse_friction: Any = None
     direction: Any = None
 
-    def contact_traction(
-        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
-    ) -> ContactTraction:
+    def contact_traction(self, kinematics: PointKinematics, parameters: Values) -> ContactTraction:
         """Return the tractions by eq. (6) and (7); where the gap is open, τ = 0 and Δβ = 0."""
         r_n, opening, penetration = signorini(kinematics, parameters["k_n"])
         closed = ufl.lt(r_n, 0)
@@ -380,14 +367,12 @@ class Tresca(FrictionLaw):
         return {n: v for n, v in super().parameters().items() if n not in without}
 
     def friction_bound(
-        self, kinematics: PointKinematics, pressure: Expr, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, pressure: Expr, parameters: Values
     ) -> Expr:
         """Return the friction bound, μ times the given pressure (stress)."""
         return parameters["friction"] * parameters["pressure"]
 
-    def contact_traction(
-        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
-    ) -> ContactTraction:
+    def contact_traction(self, kinematics: PointKinematics, parameters: Values) -> ContactTraction:
         """Return the tractions: r_n by eq. (6) or -p, and τ by eq. (7) with the bound μ p."""
         bound = self.friction_bound(kinematics, parameters["pressure"], parameters)
         traction, slip = self.return_map(kinematics, bound, parameters)
@@ -397,7 +382,7 @@ class Tresca(FrictionLaw):
             r_n = -parameters["pressure"]
         return ContactTraction(r_n, opening, penetration, traction, bound, slip)
 
-    def potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
+    def potential(self, kinematics: PointKinematics, parameters: Values) -> Expr:
         """Return the energy per area of unilateral contact [19] and of given friction [43]."""
         bound = self.friction_bound(kinematics, parameters["pressure"], parameters)
         tangential = self.sliding_potential(kinematics, bound, parameters)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any
@@ -18,7 +17,7 @@ from fenics_contact.laws.base import (
     signorini_potential,
 )
 from fenics_contact.laws.stiffness import RelativeStiffness
-from fenics_contact.types import Expr
+from fenics_contact.types import Expr, Values
 
 __all__ = ["Foundation", "Frictionless"]
 
@@ -34,9 +33,7 @@ class Frictionless(Law):
 
     k_n: Any = RelativeStiffness()
 
-    def contact_traction(
-        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
-    ) -> ContactTraction:
+    def contact_traction(self, kinematics: PointKinematics, parameters: Values) -> ContactTraction:
         """Return r_n = -k_n δ₋, δ₊ and δ₋ by eq. (6)."""
         return ContactTraction(*signorini(kinematics, parameters["k_n"]))
 
@@ -104,9 +101,7 @@ class Foundation(Law):
         """Return k_n, and k_t if there are tangential tractions, by name."""
         return {"k_n": self.k_n} | ({"k_t": self.k_t} if self.has_tangential else {})
 
-    def contact_traction(
-        self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
-    ) -> ContactTraction:
+    def contact_traction(self, kinematics: PointKinematics, parameters: Values) -> ContactTraction:
         """Return r_n = -k_n (u_n - s) and τ = -k_t u_t, without tension where closed only."""
         r_n, opening, penetration = signorini(kinematics, parameters["k_n"])
         if self.tension:
@@ -120,7 +115,7 @@ class Foundation(Law):
         return ContactTraction(r_n, opening, penetration, traction)
 
     def stored(
-        self, kinematics: PointKinematics, response: ContactTraction, parameters: Mapping[str, Expr]
+        self, kinematics: PointKinematics, response: ContactTraction, parameters: Values
     ) -> Expr:
         """Return the elastic energy per area, -r_n (u_n - s)/2 - τ·u_t/2."""
         closing = -kinematics.gap
@@ -129,7 +124,7 @@ class Foundation(Law):
             stored -= ufl.dot(response.traction, kinematics.tangential_displacement) / 2
         return stored
 
-    def potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
+    def potential(self, kinematics: PointKinematics, parameters: Values) -> Expr:
         """Return ½ k_n (u_n - s)² + ½ k_t |u_t|², or without tension ½ k_n ⟨u_n - s⟩₊² [19].
 
         Raises:
