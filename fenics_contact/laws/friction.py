@@ -44,6 +44,8 @@ class FrictionLaw(Law):
     modes: int | None = None
     transverse_friction: Any = None
     direction: Any = None
+    has_friction = True
+    has_potential = False  # as the bound depends on the pressure
 
     def __post_init__(self) -> None:
         """Check the number of the polygon's sides, and that a direction is given where needed.
@@ -66,16 +68,6 @@ class FrictionLaw(Law):
                 f"direction is {self.direction!r}, but the circular cone has none; give modes or "
                 "transverse_friction too, or omit it"
             )
-
-    @property
-    def has_friction(self) -> bool:
-        """Whether points can slip: always True."""
-        return True
-
-    @property
-    def has_potential(self) -> bool:
-        """Whether the tractions derive from a potential: not if the bound depends on pressure."""
-        return False
 
     @property
     def positive(self) -> frozenset[str]:
@@ -242,15 +234,12 @@ class FrictionLaw(Law):
 class _GivenBound(FrictionLaw):
     """A friction law with a friction bound given by the parameter "friction_bound"."""
 
+    has_potential = True
+
     def __init__(self, law: FrictionLaw) -> None:
         self._law, self.friction, self.k_t = law, law.friction, law.k_t
         self.modes, self.direction = law.modes, law.direction
         self.transverse_friction = law.transverse_friction
-
-    @property
-    def has_potential(self) -> bool:
-        """Whether the tractions derive from a potential: always True."""
-        return True
 
     def contact_traction(self, kinematics: PointKinematics, parameters: Values) -> ContactTraction:
         """Return the tractions of the law, with τ by the given friction bound."""
@@ -341,6 +330,7 @@ class Tresca(FrictionLaw):
     modes: int | None = None
     transverse_friction: Any = None
     direction: Any = None
+    has_potential = True
 
     def __post_init__(self) -> None:
         """Check ``unilateral``, and the friction cone as for every friction law.
@@ -355,11 +345,6 @@ class Tresca(FrictionLaw):
     def has_normal_stiffness(self) -> bool:
         """Whether r_n depends on the gap: as ``unilateral`` says."""
         return self.unilateral
-
-    @property
-    def has_potential(self) -> bool:
-        """Whether the tractions derive from a potential: always True."""
-        return True
 
     def parameters(self) -> dict[str, Any]:
         """Return the parameters by name; k_n is one of them only if ``unilateral``."""

@@ -63,6 +63,8 @@ class Foundation(Law):
     k_n: Any
     k_t: Any = 0.0
     tension: bool = True
+    is_physical = True
+    positive = frozenset[str]()  # both stiffnesses may vanish
 
     def __post_init__(self) -> None:
         """Check ``tension``.
@@ -86,16 +88,6 @@ class Foundation(Law):
     def has_tension(self) -> bool:
         """Whether r_n is tensile where the gap is open: as ``tension`` says."""
         return self.tension
-
-    @property
-    def is_physical(self) -> bool:
-        """Whether the stiffness is that of a physical layer: always True."""
-        return True
-
-    @property
-    def positive(self) -> frozenset[str]:
-        """Names of the parameters that must be greater than zero: none, both may vanish."""
-        return frozenset()
 
     def parameters(self) -> dict[str, Any]:
         """Return k_n, and k_t if there are tangential tractions, by name."""
