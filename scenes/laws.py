@@ -32,7 +32,7 @@ class Overclosure(fc.Law):
         """The pressure, nothing along Γc."""
         closing = -kinematics.gap
         pressure = self.pressure(closing, parameters)
-        return fc.ContactTraction(-pressure, positive_part(-closing), positive_part(closing))
+        return fc.ContactTraction(-pressure)
 
     def normal_potential(self, kinematics, parameters):
         """∫ p dδ."""
@@ -66,7 +66,7 @@ class Bond(fc.Law):
         """The pull, nothing along Γc."""
         opening = kinematics.gap
         pull = parameters["k_n"] * opening * ufl.exp(-opening / parameters["h"])
-        return fc.ContactTraction(pull, positive_part(opening), positive_part(-opening))
+        return fc.ContactTraction(pull)
 
     def normal_potential(self, kinematics, parameters):
         """∫ pull do."""
@@ -91,14 +91,11 @@ class Asperities(fc.FrictionLaw):
 
     def contact_traction(self, kinematics, parameters):
         """The pressure, and friction up to μ times it."""
-        closing = -kinematics.gap
-        penetration = positive_part(closing)
+        penetration = positive_part(-kinematics.gap)
         pressure = parameters["p0"] * (ufl.exp(penetration / parameters["h"]) - 1)
         bound = self.friction_bound(kinematics, pressure, parameters)
         traction, slip = self.return_map(kinematics, bound, parameters)
-        return fc.ContactTraction(
-            -pressure, positive_part(-closing), penetration, traction, bound, slip
-        )
+        return fc.ContactTraction(-pressure, traction, bound, slip)
 
     def normal_potential(self, kinematics, parameters):
         """∫ p dδ."""
@@ -123,10 +120,8 @@ class Saturating(fc.FrictionLaw):
 
     def contact_traction(self, kinematics, parameters):
         """Unilateral contact, and friction up to the bound."""
-        penetration = positive_part(-kinematics.gap)
-        opening = positive_part(kinematics.gap)
-        pressure = parameters["k_n"] * penetration
+        pressure = parameters["k_n"] * positive_part(-kinematics.gap)
         bound = self.friction_bound(kinematics, pressure, parameters)
         traction, slip = self.return_map(kinematics, bound, parameters)
         slip = tuple(ufl.conditional(ufl.gt(pressure, 0), mode, 0) for mode in slip)
-        return fc.ContactTraction(-pressure, opening, penetration, traction, bound, slip)
+        return fc.ContactTraction(-pressure, traction, bound, slip)

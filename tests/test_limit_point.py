@@ -37,9 +37,8 @@ class Separation(Law):
     ) -> ContactTraction:
         """Of the gap alone."""
         x = kinematics.gap / parameters["reach"]
-        opening, penetration = ufl.max_value(kinematics.gap, 0), ufl.max_value(-kinematics.gap, 0)
         pull = np.e * parameters["strength"] * x * ufl.exp(-x)
-        return ContactTraction(pull, opening, penetration)
+        return ContactTraction(pull)
 
     def normal_potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
         """Its derivative by the gap is r_n."""

@@ -213,9 +213,7 @@ def test_a_law_that_does_not_say_enough():
         p0: Any
 
         def contact_traction(self, kinematics, parameters):
-            closing = -kinematics.gap
-            r_n = -parameters["p0"] * positive_part(closing) ** 2
-            return ContactTraction(r_n, positive_part(-closing), positive_part(closing))
+            return ContactTraction(-parameters["p0"] * positive_part(-kinematics.gap) ** 2)
 
     scene = block()
     raised_everywhere(
@@ -282,8 +280,7 @@ class RootOfPenetration(fc.Law):
     def contact_traction(self, kinematics, parameters):
         """The pressure, without friction."""
         penetration = ufl.max_value(-kinematics.gap, 0)
-        opening = ufl.max_value(kinematics.gap, 0)
-        return ContactTraction(-parameters["c"] * penetration**0.5, opening, penetration)
+        return ContactTraction(-parameters["c"] * penetration**0.5)
 
     def normal_potential(self, kinematics, parameters):
         """∫ p dδ."""

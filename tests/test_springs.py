@@ -318,8 +318,6 @@ def test_a_foundation_that_lies_is_caught(what):
                 r_n = ufl.min_value(r_n, 0.0)
             return fc.ContactTraction(
                 1.01 * r_n if what == "normal" else r_n,
-                r.opening,
-                r.penetration,
                 1.01 * tau if what == "tangential" else tau,
             )
 

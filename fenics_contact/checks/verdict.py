@@ -319,9 +319,9 @@ def check_laws(contact: Contact) -> dict[str, float]:
         times the size of the mesh) divided by the tolerance, so that residual displacements and
         tractions below round-off do not count. The conditions are
 
-        - "complementarity", eq. (6): r_n ≤ 0, δ± ≥ 0, δ₊δ₋ = 0, r_n δ₊ = 0, s - u_n = δ₊ - δ₋ and
-          r_n = -k_n δ₋; with multipliers r_n = -k_n (u_n - s) - λ_n where that is negative; with a
-          `normal_potential` of the law, r_n is minus its derivative by u_n;
+        - "complementarity", eq. (6): s - u_n = δ₊ - δ₋, r_n ≤ 0 and r_n = -k_n δ₋; with multipliers
+          r_n = -k_n (u_n - s) - λ_n where that is negative; with a `normal_potential` of the law,
+          r_n is minus its derivative by u_n;
         - "stiffness" instead if the law bears tension, r_n = -k_n (u_n - s); with tangential
           tractions but no friction also τ = -K_t u_t, or τ = 0 where open;
         - with friction, "friction bound": it is `Law.friction_bound` at the pressure; "cone":
@@ -343,19 +343,8 @@ def check_laws(contact: Contact) -> dict[str, float]:
 
     x = contact.surface.mesh.geometry.x
     nowhere = np.full(1, _ROUND_OFF * (global_max(comm, x) - global_min(comm, x)))
-    opening, penetration, r_n = v.opening, v.penetration, v.normal_traction
-    length = (opening, penetration, v.initial_gap, v.normal_displacement, nowhere)
-    violations = [
-        relative(
-            worst(
-                np.minimum(opening, 0),
-                np.minimum(penetration, 0),
-                np.minimum(opening, penetration),
-                v.initial_gap - v.normal_displacement - opening + penetration,
-            ),
-            *length,
-        )
-    ]
+    r_n, gap, length = v.normal_traction, v.gap, (v.initial_gap, v.normal_displacement, nowhere)
+    violations = [relative(worst(v.initial_gap - v.normal_displacement - gap), gap, *length)]
     acting = np.where(r_n != 0, v.normal_stiffness, 0.0)  # where none acts it may be infinite
     pressure = (r_n, nowhere * acting)
     if law.has_own_normal:
@@ -365,10 +354,10 @@ def check_laws(contact: Contact) -> dict[str, float]:
         elastic = v.parameters["k_n"] * (v.normal_displacement - v.initial_gap)
         violations.append(relative(worst(r_n + elastic), *pressure))
     elif law.has_normal_stiffness and contact.multipliers is not None:
-        slack = -r_n - v.multiplier - v.parameters["k_n"] * (penetration - opening)
+        slack = -r_n - v.multiplier - v.parameters["k_n"] * -gap
         violations.append(relative(worst(np.minimum(-r_n, slack)), v.multiplier, *pressure))
     elif law.has_normal_stiffness:
-        elastic = v.parameters["k_n"] * penetration
+        elastic = v.parameters["k_n"] * v.penetration
         violations.append(relative(worst(np.maximum(r_n, 0), r_n + elastic), *pressure))
     violations.append(relative(worst(contact.traction[~paired]), contact.traction))
     found = {"stiffness" if law.has_tension else "complementarity": max(violations)}
@@ -380,7 +369,7 @@ def check_laws(contact: Contact) -> dict[str, float]:
     if not law.has_friction:
         elastic = np.einsum("qij,qj->qi", stiffness, contact.tangential_displacement[paired])
         if not law.has_tension:
-            elastic[penetration <= 0] = 0.0
+            elastic[v.penetration <= 0] = 0.0
         violation = relative(worst(tau + elastic), tau, nowhere * stiffest)
         found["stiffness"] = max(found.get("stiffness", 0.0), violation)
         return found

@@ -19,6 +19,7 @@ from fenics_contact.contact.finite import FiniteKinematics
 from fenics_contact.contact.kinematics import Seen, SmallKinematics
 from fenics_contact.contact.present import PresentKinematics
 from fenics_contact.laws.base import ContactTraction, Law, PointKinematics
+from fenics_contact.laws.return_maps import positive_part
 from fenics_contact.parallel import global_max, global_min
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
 from fenics_contact.types import Array
@@ -266,8 +267,8 @@ class PointLaw:
         response = self._response(felt)
         told = {
             "normal_displacement": self.seen.gap - felt.gap,
-            "opening": response.opening,
-            "penetration": response.penetration,
+            "opening": self._there(positive_part(felt.gap)),
+            "penetration": self._there(positive_part(-felt.gap)),
             "normal_traction": response.normal_traction,
             "stored": self._there(law.stored(felt, response, parameters)),
         }

@@ -17,7 +17,7 @@ from fenics_contact.types import Array
 
 __all__ = ["FORMAT", "Stored", "check_finite", "read_file", "refuse", "write_file"]
 
-FORMAT = 8
+FORMAT = 9
 # The file's end: these words, and the digest of all before them.
 _MARK = b"\nfenics_contact checkpoint, sha256 "
 _REMEDY = "remove it to start again"

@@ -68,7 +68,7 @@ def signature_of_law(law: Law, gdim: int, *, multipliers: bool) -> str:
         for name in law.parameters()
     }
     response = law.contact_traction(felt, given)
-    said = [response.normal_traction, response.opening, response.penetration, *response.slip]
+    said = [response.normal_traction, *response.slip]
     said.append(law.stored(felt, response, given))
     if law.has_own_normal:
         said += [law.normal_potential(felt, given), law.normal_stiffness(felt, given)]

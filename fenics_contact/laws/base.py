@@ -61,8 +61,6 @@ class ContactTraction:
 
     Attributes:
         normal_traction: Normal traction r_n, negative in compression (stress).
-        opening: Positive part δ₊ of the gap (length), eq. (6).
-        penetration: Negative part δ₋ ≥ 0 of the gap (length), eq. (6).
         traction: Tangential traction τ (stress), shape (gdim,); None if the law has none.
         friction_bound: Friction bound, the size of the yield surface: μ p of Coulomb's law
             (stress); None without friction.
@@ -70,8 +68,6 @@ class ContactTraction:
     """
 
     normal_traction: Expr
-    opening: Expr
-    penetration: Expr
     traction: Expr | None = None
     friction_bound: Expr | None = None
     slip: tuple[Expr, ...] = ()
@@ -300,17 +296,12 @@ class Law:
         return -ufl.dot(response.traction, kinematics.tangential_increment + stretched)
 
 
-def signorini(kinematics: PointKinematics, k_n: Expr) -> tuple[Expr, Expr, Expr]:
-    """Return r_n, δ₊ and δ₋ of the regularised normal law, eq. (6).
-
-    With a multiplier r_n = -⟨λ_n + k_n (u_n - s)⟩₊, eq. (8).
-    """
+def signorini(kinematics: PointKinematics, k_n: Expr) -> Expr:
+    """Return r_n of eq. (6), -k_n ⟨u_n - s⟩₊, or with a multiplier -⟨λ_n + k_n (u_n - s)⟩₊ (8)."""
     closing = -kinematics.gap
-    opening = positive_part(kinematics.gap)
-    penetration = positive_part(closing)
     if kinematics.multiplier is None:
-        return -k_n * penetration, opening, penetration
-    return -positive_part(kinematics.multiplier + k_n * closing), opening, penetration
+        return -k_n * positive_part(closing)
+    return -positive_part(kinematics.multiplier + k_n * closing)
 
 
 def signorini_potential(kinematics: PointKinematics, k_n: Expr) -> Expr:

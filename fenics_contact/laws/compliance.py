@@ -71,14 +71,14 @@ class NormalCompliance(FrictionLaw):
 
     def contact_traction(self, kinematics: PointKinematics, parameters: Values) -> ContactTraction:
         """Return r_n = -p₀ (δ₋/h)^m and τ by eq. (7) with the bound μ p."""
-        penetration, opening = positive_part(-kinematics.gap), positive_part(kinematics.gap)
+        penetration = positive_part(-kinematics.gap)
         h, m = parameters["approach"], parameters["exponent"]
         p = parameters["pressure"] * (penetration / h) ** m
         bound = self.friction_bound(kinematics, p, parameters)
         traction, slip = self.return_map(kinematics, bound, parameters)
         closed = ufl.gt(penetration, 0)
         slip = tuple(ufl.conditional(closed, mode, 0) for mode in slip)
-        return ContactTraction(-p, opening, penetration, traction, bound, slip)
+        return ContactTraction(-p, traction, bound, slip)
 
     def normal_potential(self, kinematics: PointKinematics, parameters: Values) -> Expr:
         """Return p₀ h (δ₋/h)^(m+1)/(m+1), whose derivative with respect to the gap is r_n."""

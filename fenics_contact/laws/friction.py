@@ -291,12 +291,12 @@ class Coulomb(FrictionLaw):
 
     def contact_traction(self, kinematics: PointKinematics, parameters: Values) -> ContactTraction:
         """Return the tractions by eq. (6) and (7); where the gap is open, τ = 0 and Δβ = 0."""
-        r_n, opening, penetration = signorini(kinematics, parameters["k_n"])
+        r_n = signorini(kinematics, parameters["k_n"])
         closed = ufl.lt(r_n, 0)
         bound = ufl.conditional(closed, self.friction_bound(kinematics, -r_n, parameters), 0)
         traction, slip = self.return_map(kinematics, bound, parameters)
         slip = tuple(ufl.conditional(closed, mode, 0) for mode in slip)
-        return ContactTraction(r_n, opening, penetration, traction, bound, slip)
+        return ContactTraction(r_n, traction, bound, slip)
 
 
 @dataclass(frozen=True)
@@ -361,11 +361,10 @@ class Tresca(FrictionLaw):
         """Return the tractions: r_n by eq. (6) or -p, and τ by eq. (7) with the bound μ p."""
         bound = self.friction_bound(kinematics, parameters["pressure"], parameters)
         traction, slip = self.return_map(kinematics, bound, parameters)
-        k_n = parameters["k_n"] if self.unilateral else ufl.as_ufl(0)
-        r_n, opening, penetration = signorini(kinematics, k_n)
-        if not self.unilateral:
-            r_n = -parameters["pressure"]
-        return ContactTraction(r_n, opening, penetration, traction, bound, slip)
+        r_n = -parameters["pressure"]
+        if self.unilateral:
+            r_n = signorini(kinematics, parameters["k_n"])
+        return ContactTraction(r_n, traction, bound, slip)
 
     def potential(self, kinematics: PointKinematics, parameters: Values) -> Expr:
         """Return the energy per area of unilateral contact [19] and of given friction [43]."""

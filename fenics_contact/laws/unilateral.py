@@ -34,8 +34,8 @@ class Frictionless(Law):
     k_n: Any = RelativeStiffness()
 
     def contact_traction(self, kinematics: PointKinematics, parameters: Values) -> ContactTraction:
-        """Return r_n = -k_n δ₋, δ₊ and δ₋ by eq. (6)."""
-        return ContactTraction(*signorini(kinematics, parameters["k_n"]))
+        """Return r_n = -k_n δ₋ by eq. (6)."""
+        return ContactTraction(signorini(kinematics, parameters["k_n"]))
 
 
 @dataclass(frozen=True)
@@ -95,16 +95,14 @@ class Foundation(Law):
 
     def contact_traction(self, kinematics: PointKinematics, parameters: Values) -> ContactTraction:
         """Return r_n = -k_n (u_n - s) and τ = -k_t u_t, without tension where closed only."""
-        r_n, opening, penetration = signorini(kinematics, parameters["k_n"])
-        if self.tension:
-            r_n = parameters["k_n"] * kinematics.gap
+        k_n, gap = parameters["k_n"], kinematics.gap
+        r_n = k_n * gap if self.tension else signorini(kinematics, k_n)
         if not self.has_tangential:
-            return ContactTraction(r_n, opening, penetration)
+            return ContactTraction(r_n)
         k_t = parameters["k_t"]
         if not self.tension:
-            k_t = ufl.conditional(ufl.gt(penetration, 0), k_t, 0)
-        traction = -k_t * kinematics.tangential_displacement
-        return ContactTraction(r_n, opening, penetration, traction)
+            k_t = ufl.conditional(ufl.lt(gap, 0), k_t, 0)
+        return ContactTraction(r_n, -k_t * kinematics.tangential_displacement)
 
     def stored(
         self, kinematics: PointKinematics, response: ContactTraction, parameters: Values
