@@ -57,7 +57,8 @@ class NotConverged(RuntimeError):
                 else f"increment {increment} did not converge: SNES reason {reason} after "
                 f"{self.iterations} iterations; "
             )
-            + f"{what}; the forces have magnitude {verdict.force:.3e}. Tried: {tried}. "
+            + f"{what}; the forces have magnitude {verdict.worst_equation.force:.3e}. "
+            + f"Tried: {tried}. "
             + _advice(reason, verdict, attempts, stiffnesses, driven=driven)
             + f"; -{prefix}snes_monitor shows the iterations"
         )

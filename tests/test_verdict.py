@@ -150,8 +150,9 @@ def test_the_verdict_of_a_solution():
     for step in walk(made):
         verdict = step.verdict
         assert not verdict.failures
-        assert 0 < verdict.residual <= 2 * verdict.tolerance <= 1e-8 * verdict.force
-        assert verdict.imbalance <= verdict.imbalance_tolerance <= 1e-6 * verdict.force
+        equation, resultant = verdict.worst_equation, verdict.worst_sum
+        assert 0 < equation.residual <= 2 * equation.tolerance <= 1e-8 * equation.force
+        assert resultant.residual <= resultant.tolerance <= 1e-6 * equation.force
         assert set(verdict.laws["contact"]) >= {"complementarity", "cone", "slip", "dissipation"}
         assert max(verdict.laws["contact"].values()) <= 1e-10
 

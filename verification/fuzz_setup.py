@@ -633,7 +633,7 @@ def _make_record(
         "attempts": [str(r) for r in step.attempts],
         "method": step.method,
         "iterations": step.iterations,
-        "summary": step.summary() if step.verdict.force > 0 else "",
+        "summary": step.summary() if step.verdict.worst_equation.force > 0 else "",
     }
 
 

@@ -149,29 +149,14 @@ class Verdict:
         }
 
     @property
-    def residual(self) -> float:
-        """Largest residual relative to its tolerance (force)."""
-        return self._worst(self.equations).residual
+    def worst_equation(self) -> ForceBalance:
+        """The one of `equations` with the largest residual relative to its tolerance."""
+        return max(self.equations.values(), key=ForceBalance.excess)
 
     @property
-    def force(self) -> float:
-        """Magnitude of the forces where `residual` is (force)."""
-        return self._worst(self.equations).force
-
-    @property
-    def tolerance(self) -> float:
-        """Tolerance where `residual` is (force)."""
-        return self._worst(self.equations).tolerance
-
-    @property
-    def imbalance(self) -> float:
-        """Largest resultant of all forces on a body, relative to its tolerance (force)."""
-        return self._worst(self.sums).residual
-
-    @property
-    def imbalance_tolerance(self) -> float:
-        """Tolerance where `imbalance` is (force)."""
-        return self._worst(self.sums).tolerance
+    def worst_sum(self) -> ForceBalance:
+        """The one of `sums` with the largest residual relative to its tolerance."""
+        return max(self.sums.values(), key=ForceBalance.excess)
 
     @property
     def is_loaded(self) -> bool:
@@ -183,10 +168,6 @@ class Verdict:
         """Largest residual relative to the forces; 0 without forces."""
         loaded = (balance for balance in self.equations.values() if balance.is_loaded)
         return max((balance.residual / balance.force for balance in loaded), default=0.0)
-
-    @staticmethod
-    def _worst(balances: dict[str, ForceBalance]) -> ForceBalance:
-        return max(balances.values(), key=ForceBalance.excess)
 
     def _repr_html_(self) -> str:
         """Return a table of errors and limits for notebooks."""
