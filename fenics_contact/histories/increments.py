@@ -376,9 +376,8 @@ def _history(
                         at.largest,
                     )
                 continue
-            began = problem.state.unknowns
             problem.commit()
-            at.advance(goal, problem, began if step.complete and not behind else None)
+            at.advance(goal, problem)
             halves = halves[1:]
             found = None
             if estimate and not halves:
@@ -587,18 +586,11 @@ class _Progress:
     def cut(self, tried: float) -> None:
         self.largest, self.cuts, self.successes = tried / 2, self.cuts + 1, 0
 
-    def advance(self, goal: float, problem: ContactProblem, began: Array | None) -> None:
-        """Take note of the increment that was committed. Collective.
-
-        Args:
-            goal: Load parameter at its end.
-            problem: Whose.
-            began: The unknowns where it began; None if the interior displacement was not up to date
-                at both ends.
-        """
+    def advance(self, goal: float, problem: ContactProblem) -> None:
+        """Take note of the increment to the load parameter goal that was committed. Collective."""
         self.last, self.load, self.change = goal - self.load, goal, 0.0
-        if began is not None:
-            change = problem.state.unknowns - began
+        change = problem.state.change
+        if change is not None:
             squares = global_sum(problem.u.function_space.mesh.comm, float(change @ change))
             self.change = float(np.sqrt(squares))
             self.way += self.change
