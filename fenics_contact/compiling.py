@@ -87,7 +87,6 @@ class Waiting:
     """Time that went into compilation in this process."""
 
     def __init__(self) -> None:
-        """None so far."""
         self._seconds, self._said = 0.0, False
 
     def add(self, seconds: float) -> None:

@@ -27,6 +27,12 @@ __all__ = ["OpposingBodyProbe"]
 class OpposingBodyProbe:
     """Places of Γc and of the opposite surface, both where their bodies have moved to.
 
+    The constructor follows the present normals of both surfaces to the other one. It is collective.
+
+    Args:
+        before: The displacement at the last commit; None: paths are not followed.
+        known: An earlier probe, from which on paths were not followed yet.
+
     Attributes:
         x: Where they are on the undeformed surfaces, those of Γc first, (n, gdim) (length).
         resisted: On the facets of Γc, and on those opposite: corners of facets, (m, n_corners), and
@@ -37,13 +43,6 @@ class OpposingBodyProbe:
     def __init__(
         self, contact: Contact, before: fem.Function | None, known: OpposingBodyProbe | None = None
     ) -> None:
-        """Follow the present normals of both surfaces to the other one. Collective.
-
-        Args:
-            contact: With another body.
-            before: The displacement at the last commit; None: paths are not followed.
-            known: An earlier probe, from which on paths were not followed yet.
-        """
         search = contact.pairs.search
         assert search is not None
         self._search, self.u = search, contact.u.copy()
@@ -182,7 +181,7 @@ class OpposingBodyProbe:
 
 
 class _Side:
-    """Places of one of two surfaces in their deformed bodies.
+    """Places of one of two surfaces in the bodies displaced by u. The constructor is collective.
 
     Attributes:
         side: The surface.
@@ -193,14 +192,6 @@ class _Side:
     """
 
     def __init__(self, side: Side, u: fem.Function, facet: Index, reference: Array) -> None:
-        """Locate the places. Collective.
-
-        Args:
-            side: The surface.
-            u: The displacement.
-            facet: See the attributes.
-            reference: See the attributes.
-        """
         self._u, self.side = u, side
         self.facet, self.reference, self.number = facet, reference, side.first + facet
         self._comm = side.facets.space.mesh.comm

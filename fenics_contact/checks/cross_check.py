@@ -26,7 +26,6 @@ class CrossCheck:
     """Compares the forces of contacts by two routes."""
 
     def __init__(self, contacts: Sequence[Contact]) -> None:
-        """Take the contacts; forms are compiled when first compared."""
         self._contacts = contacts
         self._forms: dict[str, Any] = {}
 

@@ -34,23 +34,15 @@ class Judge:
     """Looks at evaluated states of a problem.
 
     Attributes:
-        small_displacement_tolerance: See `ContactProblem`.
+        small_displacement_tolerance: As for `ContactProblem`.
+
+    Raises:
+        ValueError: ``cross_check`` is no bool.
     """
 
     def __init__(
         self, full: FullSystem, motions: RigidBodyModes, *, tolerance: float, cross_check: bool
     ) -> None:
-        """Measure the mesh.
-
-        Args:
-            full: The system on all unknowns.
-            motions: Rigid motions of the bodies.
-            tolerance: ``small_displacement_tolerance`` of `ContactProblem`.
-            cross_check: ``cross_check`` of `ContactProblem`.
-
-        Raises:
-            ValueError: ``cross_check`` is no bool.
-        """
         check_bool("cross_check", cross_check)
         self.small_displacement_tolerance = tolerance
         self._full, self._motions = full, motions

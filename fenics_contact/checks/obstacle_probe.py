@@ -38,6 +38,13 @@ _BISECTIONS = 20
 class RigidObstacleProbe:
     """Places of Γc in the frame of a rigid obstacle, and their paths in an increment.
 
+    The constructor samples the obstacle at the places and, on each facet, where it is deepest. It
+    is collective.
+
+    Args:
+        before: The displacement at the last commit; None: it is not known.
+        known: An earlier probe, from which on paths were not followed yet.
+
     Attributes:
         x: The places on the undeformed Γc, (n, gdim) (length).
         resisted: Corners of the facets of this rank, (m, n_corners), and the penetration of their
@@ -60,13 +67,6 @@ class RigidObstacleProbe:
         before: fem.Function | None = None,
         known: RigidObstacleProbe | None = None,
     ) -> None:
-        """Sample the obstacle at the places and, on each facet, where it is deepest. Collective.
-
-        Args:
-            contact: With a rigid obstacle.
-            before: The displacement at the last commit; None: it is not known.
-            known: An earlier probe, from which on paths were not followed yet.
-        """
         opposite, values = contact.opposite, contact.values
         assert opposite.sampler is not None
         self.places = places = contact.facet_places

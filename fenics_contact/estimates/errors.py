@@ -381,7 +381,7 @@ def _friction_bound(contact: Contact, pressure: Array) -> Array:
 
 
 class _Smoothed:
-    """Stresses and strains beside smooth ones (Zienkiewicz and Zhu).
+    """Stresses and strains beside smooth ones (Zienkiewicz and Zhu). The constructor is collective.
 
     Attributes:
         stress: Smooth σ* (UFL).
@@ -391,7 +391,6 @@ class _Smoothed:
     """
 
     def __init__(self, problem: ContactProblem, stress: Any, strain: Any) -> None:
-        """Smooth. Collective."""
         mesh = problem.u.function_space.mesh
         weight = problem.contacts[0].inputs.weight if problem.contacts else 1.0
         degree = problem.displacement.degree

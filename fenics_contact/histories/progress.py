@@ -17,21 +17,17 @@ class Bar(logging.Filter):
     """A bar of tqdm that is there while increments are solved, and gone in between.
 
     So what a script prints of a step stands on lines of its own, and so do lines of the log, before
-    which it is wiped off. It counts the way of the load, which cuts do not change. Where there is
-    neither a terminal nor a notebook nothing is shown. Of the first rank.
+    which it is wiped off. It counts the way of the load from start to end, which cuts do not
+    change. Where there is neither a terminal nor a notebook nothing is shown. Of the first rank.
+
+    Args:
+        words: At its head; may be empty.
+
+    Raises:
+        ValueError: There is no tqdm.
     """
 
     def __init__(self, words: str, start: float, end: float) -> None:
-        """Draw nothing yet.
-
-        Args:
-            words: At its head; may be empty.
-            start: The load parameter at the start of the way.
-            end: At its end.
-
-        Raises:
-            ValueError: There is no tqdm.
-        """
         super().__init__()
         try:
             from tqdm import tqdm

@@ -44,21 +44,18 @@ class Table:
 
     A row is there as soon as its increment is committed. In the plane forces, moments, areas and
     energies are per unit thickness, and the header says so, unless the contacts' weight has it.
+    The constructor is collective.
+
+    Args:
+        errors: Quantities whose errors the steps will have.
+
+    Raises:
+        ValueError: Its folder is not there, or there is a file that is no such table. On all
+            ranks.
+        OSError: It cannot be written. On all ranks.
     """
 
     def __init__(self, path: Path, problem: ContactProblem, errors: Sequence[str] = ()) -> None:
-        """See that the file can be written. Collective.
-
-        Args:
-            path: The file.
-            problem: Whose history.
-            errors: Quantities whose errors the steps will have.
-
-        Raises:
-            ValueError: Its folder is not there, or there is a file that is no such table. On all
-                ranks.
-            OSError: It cannot be written. On all ranks.
-        """
         self._path, self._problem, self._errors = path, problem, tuple(errors)
         self._comm = problem.u.function_space.mesh.comm
         names = columns(problem)

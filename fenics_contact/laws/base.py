@@ -77,7 +77,6 @@ class Parameters(dict[str, Any]):
     """Parameters of a law by name (UFL)."""
 
     def __init__(self, law: Law, values: Mapping[str, Any]) -> None:
-        """Take the values."""
         super().__init__(values)
         self._law = type(law).__name__
 

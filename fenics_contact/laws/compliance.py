@@ -52,11 +52,7 @@ class NormalCompliance(FrictionLaw):
     direction: Any = None
 
     def __post_init__(self) -> None:
-        """Check the exponent, and the friction cone as for every friction law.
-
-        Raises:
-            ValueError: The exponent is a number below 1, or the friction cone is not defined.
-        """
+        """Check the exponent, and the friction cone as for every friction law."""
         super().__post_init__()
         if is_number(self.exponent) and not self.exponent >= 1:
             raise ValueError(

@@ -333,11 +333,7 @@ class Tresca(FrictionLaw):
     has_potential = True
 
     def __post_init__(self) -> None:
-        """Check ``unilateral``, and the friction cone as for every friction law.
-
-        Raises:
-            ValueError: ``unilateral`` is no bool, or the friction cone is not defined.
-        """
+        """Check ``unilateral``, and the friction cone as for every friction law."""
         super().__post_init__()
         check_bool("unilateral of the Tresca", self.unilateral)
 

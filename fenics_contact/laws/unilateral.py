@@ -67,11 +67,7 @@ class Foundation(Law):
     positive = frozenset[str]()  # both stiffnesses may vanish
 
     def __post_init__(self) -> None:
-        """Check ``tension``.
-
-        Raises:
-            ValueError: It is no bool.
-        """
+        """Check ``tension``."""
         check_bool("tension of the Foundation", self.tension)
 
     @property

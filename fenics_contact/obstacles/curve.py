@@ -23,21 +23,18 @@ _CENTRE = 1e-6
 
 
 class Curve:
-    """The cubic spline through points, the obstacle on the left of its way.
+    """The cubic spline through points over their chords, the obstacle on the left of its way.
 
     Places from which an end of an open curve is closest are outside.
 
+    Args:
+        closed: Whether it goes on from the last point to the first.
+
     Attributes:
-        points: What it goes through, (n, 2) (length).
+        points: What it goes through, at least two, neighbours distinct, (n, 2) (length).
     """
 
     def __init__(self, points: Array, *, closed: bool) -> None:
-        """Make the spline, over the length of the chords.
-
-        Args:
-            points: At least two, neighbours distinct, (n, 2).
-            closed: Whether it goes on from the last to the first.
-        """
         self.points = points
         if closed:
             points = np.concatenate([points, points[:1]])

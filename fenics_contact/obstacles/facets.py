@@ -30,26 +30,22 @@ class Facets:
     about it; from a corner that of a ball. Places from which the border of an open surface is
     closest are outside.
 
+    Args:
+        halvings: How often triangles are `refined` towards a smooth surface.
+        sharp: Angle of edges that it keeps (radians).
+
     Attributes:
-        points: Distinct corners, (n_points, d) (length).
+        points: Corners, (n_points, d) (length); equal ones that are given become one.
         facets: Their numbers, anticlockwise seen from outside; in the plane the outside is on the
             right of the way, (n_facets, d).
         closed: Whether the surface has no border.
         size: Its largest extent, or coordinate (length).
+
+    Raises:
+        ValueError: No facet has a normal, or neighbours are turned against each other.
     """
 
     def __init__(self, points: Array, facets: Index, halvings: int = 0, sharp: float = 0.0) -> None:
-        """Make normals and search.
-
-        Args:
-            points: Corners, (n, d); equal ones are one.
-            facets: Index of the corners, (m, d).
-            halvings: How often triangles are `refined` towards a smooth surface.
-            sharp: Angle of edges that it keeps (radians).
-
-        Raises:
-            ValueError: No facet has a normal, or neighbours are turned against each other.
-        """
         self.points, self.facets = _welded(points, facets)
         if halvings:
             corners = self.points[self.facets]

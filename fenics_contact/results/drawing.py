@@ -118,19 +118,19 @@ class Shape:
 
 
 class ShapeOf:
-    """Makes `Shape` of a displacement and a stress, as they are when it is called."""
+    """Makes `Shape` of a displacement and a stress, as they are when it is called.
+
+    The constructor finds the facets, and compiles. It is collective.
+
+    Args:
+        stress: UFL tensor (3, 3); None: there is none.
+
+    Raises:
+        ValueError: u is no displacement; or the stress has another shape: without the stress
+            across a plane body that of von Mises is not known.
+    """
 
     def __init__(self, u: fem.Function, stress: Any = None) -> None:
-        """Find the facets, and compile. Collective.
-
-        Args:
-            u: Displacement.
-            stress: UFL tensor (3, 3); None: there is none.
-
-        Raises:
-            ValueError: u is no displacement; or the stress has another shape: without the stress
-                across a plane body that of von Mises is not known.
-        """
         check_instance("u", u, fem.Function)
         self._u, mesh = u, u.function_space.mesh
         if u.ufl_shape != (mesh.geometry.dim,):

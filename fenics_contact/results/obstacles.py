@@ -40,11 +40,6 @@ class ObstacleShape:
     """The surface of a contact's rigid obstacle where it is now, in a box. On the calling rank."""
 
     def __init__(self, contact: Contact) -> None:
-        """Compile the gap, or for an obstacle known in numbers the place in its frame.
-
-        Args:
-            contact: See `shapes_of`.
-        """
         self._obstacle, self._d = contact.obstacle, contact.surface.mesh.geometry.dim
         n = _POINTS[self._d] ** self._d
         element = basix.ufl.element("Lagrange", "interval", 1, shape=(self._d,))

@@ -181,10 +181,9 @@ class Writer:
 
 
 class _Body:
-    """The cells of the body and what is written of them."""
+    """The cells of the body and what is written of them. The constructor is collective."""
 
     def __init__(self, problem: ContactProblem, stress: Any) -> None:
-        """Compile. Collective."""
         self._displacement = problem.displacement
         self._mesh = mesh = problem.u.function_space.mesh
         d, name = mesh.geometry.dim, mesh.topology.cell_name()
@@ -233,14 +232,13 @@ class _Body:
 
 
 class _Surface:
-    """Γc of a contact and what is written of it.
+    """Γc of a contact and what is written of it. The constructor is collective.
 
     Attributes:
         series: Names of its two series.
     """
 
     def __init__(self, contact: Contact) -> None:
-        """Find the nodes of the facets, and compile. Collective."""
         self.series = (contact.name, f"{contact.name}_points")
         self._contact = contact
         surface, displacement = contact.surface, contact.displacement
