@@ -13,10 +13,7 @@ __all__ = ["main"]
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Print it, on the first rank. Collective.
-
-    Args:
-        words: Of the command line; by default those of this program.
+    """Print it on the first rank, as the words of the command line say. Collective.
 
     Returns:
         0, for the shell.

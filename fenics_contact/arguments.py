@@ -23,10 +23,6 @@ _CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 def check_bool(name: str, value: Any) -> None:
     """Refuse what is neither True nor False, of Python or NumPy.
 
-    Args:
-        name: Of the argument.
-        value: What was given.
-
     Raises:
         ValueError: It names the argument, what it is, and what it must be.
     """
@@ -36,10 +32,6 @@ def check_bool(name: str, value: Any) -> None:
 
 def check_cells(name: str, kind: str) -> None:
     """Refuse cells whose facets are not all alike, as those of prisms and pyramids.
-
-    Args:
-        name: Of the mesh.
-        kind: Of its cells, as DOLFINx calls it.
 
     Raises:
         ValueError: It says which cells are taken.
@@ -67,16 +59,10 @@ def check_positive(
     *,
     infinite: bool = False,
 ) -> None:
-    """Refuse what is no positive number.
-
-    Args:
-        name: Of the argument.
-        value: What was given.
-        what: It must be, in words.
-        infinite: Whether it may be infinite.
+    """Refuse what is no positive number; it may be ``infinite``.
 
     Raises:
-        ValueError: It names the argument, what it is, and what it must be.
+        ValueError: It names the argument, what it is, and ``what`` it must be.
     """
     if not (is_number(value) and value > 0 and (infinite or value < np.inf)):
         raise ValueError(f"{name} is {value!r}; it must be {what}")
@@ -85,14 +71,8 @@ def check_positive(
 def check_instance(name: str, value: Any, kind: type, advice: str = "") -> None:
     """Refuse what is of another class.
 
-    Args:
-        name: Of the argument.
-        value: What was given.
-        kind: The class.
-        advice: What to do, at the end of the message.
-
     Raises:
-        ValueError: It names the argument, what it is, and what it must be.
+        ValueError: It names the argument, what it is, and what it must be; the advice ends it.
     """
     if isinstance(value, kind):
         return

@@ -32,11 +32,7 @@ _ORDERINGS = {0: "AMD", 2: "AMF", 3: "SCOTCH", 4: "PORD", 5: "METIS", 6: "QAMD"}
 
 
 def information(comm: MPI.Comm = MPI.COMM_WORLD) -> dict[str, str]:
-    """What there is and what is missing, by name; measured, not looked up. Collective.
-
-    Args:
-        comm: The ranks to tell of.
-    """
+    """What there is and what is missing, by name; measured, not looked up. Collective."""
     found = {"fenics_contact": __version__, "Python": platform.python_version()}
     for name in ("ufl", "basix", "ffcx", "numpy", "scipy", "mpi4py", "petsc4py"):
         found[name] = _version(name)

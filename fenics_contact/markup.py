@@ -16,11 +16,7 @@ def shown(
 ) -> str:
     """A table with a title, the first cell of each row its name, and lines below it.
 
-    Args:
-        title: Text, as all that follows: what would be markup is escaped.
-        header: Of the columns.
-        rows: As long as the header.
-        remarks: Lines.
+    All is text: what would be markup is escaped.
     """
     lines = [f"<table><caption>{escape(title)}</caption><thead><tr>"]
     lines += [f"<th>{escape(name)}</th>" for name in header]

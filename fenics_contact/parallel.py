@@ -44,10 +44,6 @@ def fail_together(comm: MPI.Comm, error: BaseException) -> None:
     A rank that fails where others do not is waited for by them in some collective call, for ever:
     no rank can go on, nor take back what was begun. The failures are told to one another by
     messages, which are not taken for a part of that call.
-
-    Args:
-        comm: The ranks.
-        error: What this rank is about to raise.
     """
     others = [rank for rank in range(comm.size) if rank != comm.rank]
     requests = [comm.Isend(b"", rank, _TAG) for rank in others]
@@ -102,11 +98,7 @@ def warn(comm: MPI.Comm, text: str, *, category: type[Warning] = UserWarning) ->
 
     On all of them, because a warning may have been made an error. In the log, because FFCx leads
     Python's warnings into one of its own, which nobody sees where logging has not been set up.
-
-    Args:
-        comm: The ranks; nothing is communicated.
-        text: The same on every rank.
-        category: Of the Python warning.
+    Nothing is communicated: the text is the same on every rank.
     """
     if comm.rank == 0:
         logger.warning(text)

@@ -141,13 +141,12 @@ class OpposingBodyProbe:
         return np.where(met, depth, 0.0), allowed
 
     def _tangent_planes(self, resisted: Array) -> tuple[Array, Array]:
-        """Those of the opposite surface, of the facets of all ranks. Collective.
+        """Those of the opposite surface, of the facets of all ranks, see `tangent_planes_around`.
+
+        Collective.
 
         Args:
             resisted: Penetration at the points that the law resists, (n_points,) (length).
-
-        Returns:
-            See `_with_those_around`.
         """
         n, here = self._rows.size, self._here
         ray, normal = here.normal[:n], _normals(self._hits)[:n]

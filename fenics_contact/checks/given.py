@@ -78,11 +78,7 @@ def constrained_unknowns(
 ) -> Mask:
     """This rank's unknowns with Dirichlet conditions, (n_local,). Collective.
 
-    Args:
-        bcs: The conditions.
-        u: What is solved for.
-        unknowns: Of the problem.
-        mixed: Whether the displacement is a part of ``u``.
+    The displacement may be a part of a mixed function ``u``.
 
     Raises:
         ValueError: A condition is of another function.
@@ -125,11 +121,6 @@ def check_contacts(
     contacts: Sequence[Contact], displacement: Displacement, constrained: Mask
 ) -> None:
     """Refuse contacts of one name or one free motion, and Γc where all is prescribed. Collective.
-
-    Args:
-        contacts: Of a problem.
-        displacement: Likewise.
-        constrained: What `constrained_unknowns` gave.
 
     Raises:
         ValueError: On all ranks.
@@ -182,9 +173,6 @@ def check_start(contacts: Sequence[Contact]) -> float:
     """Refuse input out of range; warn of what makes forces wrong without an error. Collective.
 
     These are bodies in their obstacles, points too few for what is opposite, one obstacle twice.
-
-    Args:
-        contacts: Of a problem.
 
     Returns:
         Largest penetration of the undeformed body (length), 0 if none; an interference by a

@@ -50,9 +50,6 @@ def spring_stiffness(contact: Contact) -> Array:
     """What the traction loses per displacement at the present state, (n_points, gdim, gdim).
 
     Linearised, with the status of the points as it is.
-
-    Args:
-        contact: Evaluated.
     """
     law, values, status = contact.law, contact.values, contact.status
     normal = values.normal
@@ -272,12 +269,7 @@ def linearisation(
     """Estimate the error of the small-displacement assumption, by contact. Collective.
 
     Where a contact is of several bodies, or groups of them that it couples, it is that of the worst
-    one, relative to what that bears.
-
-    Args:
-        contacts: Evaluated contacts, at a solution.
-        scales: Reference scales of the bodies.
-        respond: Solves with the bulk's tangent.
+    one, relative to what that bears. The contacts are evaluated, at a solution.
     """
     deviations = [Deviation.of(c) for c in contacts]
     looked_at = [
@@ -303,13 +295,7 @@ def linearisation(
 
 
 def _parts(contact: Contact, scales: ReferenceScales, number: int) -> list[_Part]:
-    """The parts of a contact, the same on all ranks. Collective.
-
-    Args:
-        contact: Evaluated.
-        scales: Reference scales of the bodies.
-        number: Of the contact.
-    """
+    """The parts of the contact of a number, the same on all ranks. Collective."""
     masks = scales.parts_of(number)
     force = contact.measure * np.linalg.norm(contact.traction, axis=1)
     borne = global_sum(contact.surface.mesh.comm, [force @ points for points in masks.values()])

@@ -103,9 +103,7 @@ class RigidObstacleProbe:
     def _in_frame(self, contact: Contact, u: fem.Function | None) -> Array:
         """The nodes in the present frame of the obstacle; see `FacetPlaces.at_nodes`. Collective.
 
-        Args:
-            contact: The contact, evaluated.
-            u: The displacement; None: of it no more than the points carry.
+        Without u, the displacement, no more of it than the points carry.
         """
         opposite, values = contact.opposite, contact.values
         return self.places.at_nodes(

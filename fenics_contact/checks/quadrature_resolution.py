@@ -20,15 +20,9 @@ _NOTABLE_ERROR = 0.08
 
 
 def warn_of_few_points(contact: Contact) -> bool:
-    """Warn if facets are too long for the curvature of a rigid obstacle. Collective.
+    """Warn if facets are too long for a rigid obstacle's curvature; whether they are. Collective.
 
     If the radius is known when the contact is created, `ContactSurface` uses enough points.
-
-    Args:
-        contact: An evaluated contact.
-
-    Returns:
-        Whether a warning was given.
     """
     quadrature, comm = contact.quadrature, contact.surface.mesh.comm
     curvature = contact.opposite.largest_curvature()
@@ -54,15 +48,9 @@ def warn_of_few_points(contact: Contact) -> bool:
 
 
 def warn_of_divided_facets(contact: Contact) -> bool:
-    """Warn if the boundary of the opposite surface divides loaded facets. Collective.
+    """Warn if the opposite surface's boundary divides loaded facets; whether it does. Collective.
 
     Its position along a facet is resolved to half of the distance between two quadrature points.
-
-    Args:
-        contact: An evaluated contact.
-
-    Returns:
-        Whether a warning was given.
     """
     if not contact.opposite.follows:
         return False

@@ -52,13 +52,7 @@ class Tunnelling:
 
     @classmethod
     def of(cls, comm: MPI.Comm, probe: _Probe, resisted: ResistedDepth) -> Tunnelling:
-        """Judge the places of one contact. Collective.
-
-        Args:
-            comm: The ranks.
-            probe: Of the contact.
-            resisted: By the points of all contacts.
-        """
+        """Judge the places of one contact, by what the points of all resist. Collective."""
         depth, allowed = probe.depth(resisted)
         worst = _worst(comm, depth - allowed, np.column_stack([depth, allowed, probe.x]))
         through = probe.crossed(allowed)
@@ -112,8 +106,7 @@ class TunnellingCheck:
     def evaluate(self, before: fem.Function | None) -> dict[str, Tunnelling]:
         """Judge the contacts, evaluated at the end of an increment, by their names. Collective.
 
-        Args:
-            before: The displacement at the last commit; None: paths are not followed.
+        Without the displacement at the last commit paths are not followed.
         """
         if not self._contacts:
             return {}

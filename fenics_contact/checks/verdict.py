@@ -289,10 +289,7 @@ class Verdict:
 def check_laws(contact: Contact) -> dict[str, float]:
     """Evaluate the contact conditions at every quadrature point, without the return map.
 
-    Collective.
-
-    Args:
-        contact: An evaluated contact.
+    Collective. The contact is evaluated.
 
     Returns:
         The largest violation of each condition, relative to the largest value concerned; NaN if

@@ -120,13 +120,8 @@ def read_file(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
 def check_finite(name: str, array: Array, where: str) -> None:
     """Refuse values that are not finite: of a state all, of results and the caller's some.
 
-    Args:
-        name: Of the array.
-        array: Its values.
-        where: What it is of and what follows, for the message.
-
     Raises:
-        ValueError: It names the array.
+        ValueError: It names the array, what it is of, and what follows.
     """
     # Where an increment is cut is infinite where none was; what is evaluated may be anything.
     wrong = np.isnan(array) if name == "numbers" else ~np.isfinite(array)

@@ -164,10 +164,7 @@ def energy_column(problem: ContactProblem, name: str) -> str:
 def column(contact: Contact, name: str, unit: str) -> str:
     """Name and unit of a column of a contact.
 
-    Args:
-        contact: The contact.
-        name: Of the quantity.
-        unit: "force", "force length" or "area", which may be per unit thickness; or another one.
+    "force", "force length" and "area" may be per unit thickness.
     """
     integral = unit in ("force", "force length", "area") and contact.inputs.per_thickness
     return f"{contact.name}: {name} ({unit}{_PER_THICKNESS if integral else ''})"

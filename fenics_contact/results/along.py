@@ -50,11 +50,9 @@ class Along:
 
 
 def along(contact: Contact, unit: str = "mm") -> Along | None:
-    """Order the points of Γc along it, on the first rank; None on the others. Collective.
+    """Order the points of Γc of a plane body along it; on the first rank, else None. Collective.
 
-    Args:
-        contact: Evaluated, of a plane body.
-        unit: Of length, for the label.
+    The unit is that of length, for the label.
     """
     facets = FacetSet(contact.displacement.u.function_space, contact.surface.facets)
     rows = contact.quadrature.point_rows

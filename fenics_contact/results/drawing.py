@@ -269,9 +269,7 @@ def facets_of(
 ) -> tuple[Array, Array, npt.NDArray[Any]] | None:
     """Corners of the facets of Γc, their displacement and values, on the first rank. Collective.
 
-    Args:
-        contact: Its displacement is up to date.
-        values: Of this rank's facets.
+    The displacement is up to date; the values are of this rank's facets.
     """
     u = contact.displacement.u
     facets = FacetSet(u.function_space, contact.surface.facets)

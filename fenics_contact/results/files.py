@@ -30,12 +30,8 @@ def check_file(path: Path) -> None:
 def check_folder(name: str, path: Path) -> None:
     """Refuse a file whose folder is not there, or takes no files. On the calling rank only.
 
-    Args:
-        name: Of the argument that names the file.
-        path: The file.
-
     Raises:
-        ValueError: There is no such folder.
+        ValueError: There is no such folder; it names the argument.
         OSError: Nothing can be written to it.
     """
     folder = path.parent

@@ -39,12 +39,7 @@ CELLS = {
 
 
 def nodes(cell: str, degree: int) -> Array:
-    """Reference coordinates of a cell's nodes in VTK's order, (n_nodes, d).
-
-    Args:
-        cell: DOLFINx's name.
-        degree: 1 or 2.
-    """
+    """Reference coordinates of a cell's nodes of degree 1 or 2 in VTK's order, (n_nodes, d)."""
     kind, equispaced = basix.CellType[cell], basix.LagrangeVariant.equispaced
     places = basix.create_element(basix.ElementFamily.P, kind, degree, equispaced).points
     order = dolfinx.io.utils.cell_perm_vtk(dolfinx.mesh.CellType[cell], len(places))
