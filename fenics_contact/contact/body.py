@@ -47,10 +47,11 @@ class BodyOpposite(Opposite):
 
     def told(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """See `Opposite`."""
+        told = super().told(arrays) | self._told_of_pairs(arrays)
         since = 0.0 if self.pairs.found_jump is None else self.pairs.found_jump
-        slide, normal = arrays["jump"] - since, arrays["normal"]
+        slide, normal = told["jump"] - since, arrays["normal"]
         slide = slide - np.sum(slide * normal, axis=1)[:, None] * normal
-        return self._told_of_pairs(arrays) | {"slide": slide}
+        return told | {"slide": slide}
 
     def _told_of_pairs(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """Which points have an opposite, and how deep they are in it."""
@@ -172,7 +173,7 @@ class FollowedOpposite(BodyOpposite):
         super().__init__(parts, pairs)
         self._present = pairs
         self.felt = pairs.felt.function
-        self.in_form = self.at_points = PresentKinematics(pairs, parts.multipliers)
+        self.in_form = self.at_points = PresentKinematics(parts.multipliers)
 
     def update(self) -> None:
         """See `Opposite`."""
@@ -184,8 +185,17 @@ class FollowedOpposite(BodyOpposite):
 
     def told(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """See `Opposite`: ways are counted from the committed bodies, where they are none."""
-        foot = {"foot": np.zeros_like(arrays["jump"])} if self._parts.law.has_friction else {}
-        return self._told_of_pairs(arrays) | foot
+        pairs, normal = self._present, self._present.felt.values("normal")
+        told = self._told_of_pairs(arrays) | {"normal": normal, "jump": pairs.jump_since()}
+        if not self._parts.law.has_friction:
+            return told
+        framed = {"framed_normal": normal, "framed_traction": arrays["traction"]}
+        if "elastic_slip" in arrays:
+            framed["elastic_slip"] = arrays["elastic_slip"]
+        told |= {name: pairs.turned(vectors, back=True) for name, vectors in framed.items()}
+        old = pairs.turned(self._parts.history.values("traction"))
+        old -= np.sum(old * normal, axis=1)[:, None] * normal
+        return told | {"foot": np.zeros_like(normal), "carried_traction": old}
 
     def tangent(self, law: PointLaw) -> PointTangent:
         """See `Opposite`."""

@@ -12,7 +12,7 @@ the new one by the smallest rotation.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,8 +21,8 @@ import ufl
 from dolfinx import fem
 from ufl.algorithms.analysis import extract_constants, extract_type
 
-from fenics_contact.contact.kinematics import Seen, combined, tangential
-from fenics_contact.laws.base import ContactTraction, Law, PointKinematics
+from fenics_contact.contact.kinematics import Seen, tangential
+from fenics_contact.laws.base import Law, PointKinematics
 from fenics_contact.obstacles.base import Placement
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
@@ -34,6 +34,7 @@ __all__ = [
     "FiniteKinematics",
     "Frame",
     "SampledView",
+    "carried_history",
     "check_places",
     "check_rigid",
     "depends_on_place",
@@ -68,6 +69,12 @@ class Frame:
             z = ufl.dot(matrix, z - about) + about
         return z if self.shift is None else z + self.shift
 
+    def relative(self, x: Any, jump: Any) -> Any:
+        """Displacement in the frame, of a point displaced from x."""
+        if self.rotation is None:  # not x less x
+            return jump if self.shift is None else jump - self.shift
+        return self.into(x + jump) - x
+
     def turned(self, vector: Any) -> Any:
         """A direction given in the frame."""
         return vector if self.rotation is None else ufl.dot(self.rotation[0], vector)
@@ -79,63 +86,65 @@ class Frame:
         return ufl.dot(ufl.transpose(self.rotation[0]), vector)
 
 
+@dataclass(frozen=True)
+class View:
+    """What a point that has moved sees of a rigid obstacle (UFL).
+
+    Attributes:
+        gap: Distance to the obstacle at X + u (length).
+        normal: Unit normal from body to obstacle there.
+        carried: What was committed, as the obstacle has carried it along, see `carried_history`;
+            empty without friction.
+    """
+
+    gap: Any
+    normal: Any
+    carried: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
 class ExactView:
-    """How an obstacle is seen from points that have moved: by its own expressions."""
+    """How an obstacle is seen from points that have moved: by its own expressions.
 
-    def __init__(
-        self,
-        x: Any,
-        frame: Frame,
-        place: Callable[[Any], Placement],
-        history: PointFields,
-        multipliers: PointFields | None,
-    ) -> None:
-        """Take them.
+    Attributes:
+        x: Coordinates of the undeformed Γc.
+        frame: The frame of the obstacle.
+        place: Gap and direction at coordinates in the frame.
+        carried: What was committed, see `View`.
+    """
 
-        Args:
-            x: Coordinates of the undeformed Γc.
-            frame: Of the obstacle.
-            place: Gap and direction at coordinates in the frame.
-            history: The committed state, vectors in the frame.
-            multipliers: Likewise.
-        """
-        self._x, self._frame, self._place = x, frame, place
-        self._history, self._multipliers = history, multipliers
+    x: Any
+    frame: Frame
+    place: Callable[[Any], Placement]
+    carried: Mapping[str, Any]
 
-    def gap(self, jump: Any) -> Any:
-        """Distance to the obstacle at X + u (UFL, length)."""
-        return self._place(self._frame.into(self._x + jump)).gap
+    def __call__(self, jump: Any) -> View:
+        """What is seen from X + u."""
+        placement = self.place(self.frame.into(self.x + jump))
+        return View(placement.gap, self.frame.turned(placement.normal), self.carried)
 
-    def normal(self, jump: Any) -> Any:
-        """Unit normal from body to obstacle there (UFL)."""
-        return self._frame.turned(self._place(self._frame.into(self._x + jump)).normal)
 
-    def relative(self, jump: Any) -> Any:
-        """Displacement in the frame of the obstacle (UFL, length)."""
-        if self._frame.rotation is None:  # not X less X
-            return jump if self._frame.shift is None else jump - self._frame.shift
-        return self._frame.into(self._x + jump) - self._x
+def carried_history(
+    x: Any, frame: Frame, history: PointFields, multipliers: PointFields | None
+) -> dict[str, Any]:
+    """What was committed with friction, as the obstacle has carried it along (UFL).
 
-    def framed(self, vector: Any) -> Any:
-        """A direction as it is in that frame (UFL)."""
-        return self._frame.turned_back(vector)
+    Args:
+        x: Coordinates of the undeformed Γc.
+        frame: The frame of the obstacle.
+        history: The committed state, vectors in the frame.
+        multipliers: λ_n and λ_t, likewise; None with a penalty.
 
-    def carried(self, name: str) -> Any:
-        """What was committed, as the obstacle has carried it along (UFL).
-
-        Args:
-            name: "foot", its place minus X (length); "traction" and "normal", of the multipliers
-                where there are any; "committed traction" and "committed normal".
-        """
-        if name == "foot":
-            foot = self._history.ufl("jump")
-            if self._frame.rotation is None:
-                return foot if self._frame.shift is None else foot + self._frame.shift
-            return self._frame.place(self._x + foot) - self._x
-        kept = self._history
-        if self._multipliers is not None and not name.startswith("committed "):
-            kept = self._multipliers
-        return self._frame.turned(kept.ufl(name.removeprefix("committed ")))
+    Returns:
+        "foot", its place minus X (length); "traction" (stress) and "normal", of the multipliers
+        where there are any.
+    """
+    foot, kept = history.ufl("jump"), multipliers or history
+    if frame.rotation is not None:
+        foot = frame.place(x + foot) - x
+    elif frame.shift is not None:
+        foot = foot + frame.shift
+    return {"foot": foot} | {name: frame.turned(kept.ufl(name)) for name in ("traction", "normal")}
 
 
 class SampledView:
@@ -151,9 +160,7 @@ class SampledView:
         exact: ExactView,
         quadrature: SurfaceQuadrature,
         jump: fem.Function,
-        *,
-        turns: bool,
-        friction: bool,
+        history: PointFields,
     ) -> None:
         """Compile. Collective.
 
@@ -161,27 +168,26 @@ class SampledView:
             exact: What to sample.
             quadrature: The points.
             jump: Displacement of the body there.
-            turns: Whether the obstacle turns.
-            friction: Whether there is any.
+            history: The committed state, vectors in the frame of the obstacle.
         """
-        d = quadrature.surface.mesh.geometry.dim
-        self._jump, self._turns = jump, turns
+        d, frame = quadrature.surface.mesh.geometry.dim, exact.frame
         moved = ufl.variable(jump)
-        gap, normal = exact.gap(moved), exact.normal(moved)
-        by_place = ufl.diff(normal, moved)
-        expressions = {"gap": gap, "slope": ufl.diff(gap, moved), "normal": normal}
+        seen = exact(moved)
+        by_place, unit = ufl.diff(seen.normal, moved), ufl.Identity(d)
+        expressions = {"gap": seen.gap, "slope": ufl.diff(seen.gap, moved), "normal": seen.normal}
         expressions |= {f"turn {i}": by_place[i, :] for i in range(d)}
-        expressions |= {"relative": exact.relative(moved)}
-        if turns:
-            unit = ufl.Identity(d)
-            expressions |= {f"axis {i}": exact.framed(unit[:, i]) for i in range(d)}
-        if friction:
-            names = ("foot", "traction", "normal", "committed traction", "committed normal")
-            expressions |= {f"carried {n}": exact.carried(n) for n in names}
+        expressions |= {"relative": frame.relative(exact.x, moved)}
+        if frame.rotation is not None:
+            expressions |= {f"axis {i}": frame.turned_back(unit[:, i]) for i in range(d)}
+        expressions |= {f"carried {name}": value for name, value in seen.carried.items()}
+        if seen.carried:
+            old, before = (frame.turned(history.ufl(n)) for n in ("traction", "normal"))
+            expressions["committed traction"] = _turned(old, before, seen.normal)
+        self._jump, self._d, self._carried = jump, d, list(seen.carried)
+        self._turns = frame.rotation is not None
         self._evaluate = PointEvaluator(quadrature, expressions)
         sizes = {name: e.ufl_shape[0] if e.ufl_shape else 0 for name, e in expressions.items()}
         self._fields = PointFields(quadrature, sizes | {"at": d})
-        self._d = d
 
     def update(self) -> None:
         """Sample at the present displacement of the points. Collective."""
@@ -193,88 +199,46 @@ class SampledView:
         """What was sampled by a name: "gap", "slope" (of the gap), "normal" …; a copy."""
         return self._fields.values(name)
 
-    def turned(self, vectors: Array) -> Array:
-        """Directions in the frame of the obstacle, as they are in space: (n_points, gdim)."""
+    def turned(self, vectors: Array, *, back: bool = False) -> Array:
+        """Directions in the frame of the obstacle as they are in space, or back, (n_points, d)."""
         if not self._turns:
             return vectors
         axes = np.stack([self.values(f"axis {i}") for i in range(self._d)], axis=1)
-        return np.asarray(np.einsum("qij,qj->qi", axes, vectors))
+        return np.asarray(np.einsum("qij,qi->qj" if back else "qij,qj->qi", axes, vectors))
 
-    def gap(self, jump: Any) -> Any:
-        """See `ExactView.gap`."""
-        field = self._fields.ufl
-        return field("gap") + ufl.dot(field("slope"), jump - field("at"))
-
-    def normal(self, jump: Any) -> Any:
-        """See `ExactView.normal`."""
+    def __call__(self, jump: Any) -> View:
+        """What is seen from X + u, near the displacement that was sampled."""
         field, change = self._fields.ufl, jump - self._fields.ufl("at")
+        gap = field("gap") + ufl.dot(field("slope"), change)
         turn = [ufl.dot(field(f"turn {i}"), change) for i in range(self._d)]
-        return field("normal") + ufl.as_vector(turn)
-
-    def relative(self, jump: Any) -> Any:
-        """See `ExactView.relative`."""
-        return self._fields.ufl("relative") + self.framed(jump - self._fields.ufl("at"))
-
-    def framed(self, vector: Any) -> Any:
-        """See `ExactView.framed`."""
-        if not self._turns:
-            return vector
-        return combined(vector, [self._fields.ufl(f"axis {i}") for i in range(self._d)])
-
-    def carried(self, name: str) -> Any:
-        """See `ExactView.carried`."""
-        return self._fields.ufl(f"carried {name}")
+        carried = {name: field(f"carried {name}") for name in self._carried}
+        return View(gap, field("normal") + ufl.as_vector(turn), carried)
 
 
+@dataclass(frozen=True)
 class FiniteKinematics:
     """Displacements of any size relative to a rigid obstacle; see the module.
 
-    As in small displacements a law sees s - u_n as the gap: u_n is what the gap s that Γc had at
-    first, from where the obstacle is now, has lost.
+    Attributes:
+        view: How the obstacle is seen from displaced points.
+        multipliers: λ_n and λ_t, which take the place of committed tractions.
     """
 
-    def __init__(self, view: ExactView | SampledView, multipliers: PointFields | None) -> None:
-        """Take how the obstacle is seen.
+    view: Callable[[Any], View]
+    multipliers: PointFields | None
 
-        Args:
-            view: That.
-            multipliers: λ_n and λ_t, which take the place of committed tractions.
-        """
-        self._view, self._multipliers = view, multipliers
-
-    def felt(self, jump: Any, law: Law, seen: Seen) -> PointKinematics:
+    def __call__(self, jump: Any, law: Law, seen: Seen) -> PointKinematics:
         """What a law sees of a displacement of the body (UFL)."""
-        view = self._view
-        gap, normal = view.gap(jump), view.normal(jump)
+        view = self.view(jump)
         total = increment = traction = multiplier = None
-        if self._multipliers is not None:
-            multiplier = self._multipliers.ufl("pressure")
+        if self.multipliers is not None:
+            multiplier = self.multipliers.ufl("pressure")
         if law.has_friction:
-            foot = jump + gap * normal
-            total = tangential(seen.relative(jump), normal)
-            increment = tangential(foot - view.carried("foot"), normal)
-            traction = _turned(view.carried("traction"), view.carried("normal"), normal)
-        return PointKinematics(gap, normal, total, increment, traction, multiplier)
-
-    def told(
-        self, jump: Any, law: Law, seen: Seen, felt: PointKinematics, response: ContactTraction
-    ) -> dict[str, Any]:
-        """What of it is told beside what laws see (UFL), by its name in `PointValues`."""
-        view, normal = self._view, felt.normal
-        told = {"normal": normal, "jump": view.relative(jump)}
-        if law.has_friction:
-            old = view.carried("committed traction"), view.carried("committed normal")
-            told |= {
-                "foot": view.relative(jump) + view.framed(felt.gap * normal),
-                "framed_normal": view.framed(normal),
-                "framed_traction": view.framed(response.traction),
-                "carried_traction": _turned(*old, normal),
-            }
-        return told
-
-    def framed(self, vector: Any) -> Any:
-        """A direction as the history has it (UFL)."""
-        return self._view.framed(vector)
+            carried, foot = view.carried, jump + view.gap * view.normal
+            total = tangential(seen.relative(jump), view.normal)
+            increment = tangential(foot - carried["foot"], view.normal)
+            traction = _turned(carried["traction"], carried["normal"], view.normal)
+        return PointKinematics(view.gap, view.normal, total, increment, traction, multiplier)
 
 
 def _turned(vector: Any, before: Any, normal: Any) -> Any:

@@ -22,11 +22,11 @@ import ufl
 from dolfinx import fem
 
 from fenics_contact.contact.inputs import Inputs, check_given
-from fenics_contact.contact.kinematics import Seen, SmallKinematics
+from fenics_contact.contact.kinematics import Kinematics, Seen, SmallKinematics
 from fenics_contact.contact.obstacle_sampler import ObstacleSampler
 from fenics_contact.contact.pairs import Pairs, PairsState
 from fenics_contact.contact.point_data import PointData
-from fenics_contact.contact.point_law import AnyKinematics, PointLaw, PointTangent
+from fenics_contact.contact.point_law import PointLaw, PointTangent
 from fenics_contact.contact.sampled import SampledPlaces
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law, Parameters
@@ -184,9 +184,8 @@ class Opposite(ABC):
         self.given = self._see(placement)
         self.data, self.sampled = self._sample(placement)
         self.felt = jump
-        small = SmallKinematics(parts.history, parts.multipliers)
-        self.in_form: AnyKinematics = small
-        self.at_points: AnyKinematics = small
+        self.in_form: Kinematics = SmallKinematics(parts.history, parts.multipliers)
+        self.at_points: Kinematics = self.in_form
         self.committed_jump: Array = np.zeros((parts.quadrature.n_points, self._gdim))
         self.committed_angle = 0.0
         self._displaced: ObstacleMotion | None = None
@@ -316,7 +315,8 @@ class Opposite(ABC):
 
     def told(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """What else is known at the points, beside what a law told; see `PointValues`."""
-        return {}
+        rows = self.jump.x.array.reshape(-1, self._gdim)[: self._parts.quadrature.n_points]
+        return {"jump": rows - self.data.values.get("obstacle", 0.0)}
 
     def tangent(self, law: PointLaw) -> PointTangent:
         """Derivatives of a law's tractions where the points are. Collective."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import ufl
@@ -15,19 +15,14 @@ from ufl.algorithms.apply_derivatives import apply_derivatives
 from ufl.corealg.traversal import traverse_unique_terminals
 from ufl.domain import extract_unique_domain
 
-from fenics_contact.contact.finite import FiniteKinematics
-from fenics_contact.contact.kinematics import Seen, SmallKinematics
-from fenics_contact.contact.present import PresentKinematics
+from fenics_contact.contact.kinematics import Kinematics, Seen
 from fenics_contact.laws.base import ContactTraction, Law, PointKinematics
 from fenics_contact.laws.return_maps import positive_part
 from fenics_contact.parallel import global_max, global_min
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
 from fenics_contact.types import Array
 
-__all__ = ["AnyKinematics", "PointLaw", "PointTangent"]
-
-
-AnyKinematics: TypeAlias = SmallKinematics | FiniteKinematics | PresentKinematics
+__all__ = ["PointLaw", "PointTangent"]
 
 
 # The size of the mesh times this is a penetration that is next to none.
@@ -73,7 +68,7 @@ class PointLaw:
         self,
         law: Law,
         seen: Seen,
-        kinematics: AnyKinematics,
+        kinematics: Kinematics,
         quadrature: SurfaceQuadrature,
         jump: fem.Function,
         *,
@@ -116,7 +111,7 @@ class PointLaw:
 
     def _felt(self, jump: Any = None, seen: Seen | None = None) -> PointKinematics:
         jump = self._jump if jump is None else jump
-        return self._kinematics.felt(jump, self.law, seen or self.seen)
+        return self._kinematics(jump, self.law, seen or self.seen)
 
     def _response(self, felt: PointKinematics, seen: Seen | None = None) -> ContactTraction:
         """What the law answers, nothing at points at which it does not act."""
@@ -272,7 +267,6 @@ class PointLaw:
             "normal_traction": response.normal_traction,
             "stored": self._there(law.stored(felt, response, parameters)),
         }
-        told |= self._kinematics.told(self._jump, law, self.seen, felt, response)
         if law.has_own_normal:
             told |= self._own_normal(felt, response)
         if law.has_tangential:
@@ -304,8 +298,7 @@ class PointLaw:
             if law.has_friction:
                 assert felt.traction is not None
                 borne = felt.traction - response.traction
-                slip = law.elastic_displacement(felt, borne, parameters)
-                told |= {"elastic_slip": self._kinematics.framed(slip)}
+                told["elastic_slip"] = law.elastic_displacement(felt, borne, parameters)
         return self._evaluator(told)
 
     @cached_property

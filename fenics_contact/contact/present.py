@@ -29,10 +29,10 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact.compat import sparse_matrix
-from fenics_contact.contact.kinematics import Seen, combined, tangential
+from fenics_contact.contact.kinematics import Seen, tangential
 from fenics_contact.contact.pairs import Pairs, PairsState
 from fenics_contact.contact.values import PointValues
-from fenics_contact.laws.base import ContactTraction, Law, PointKinematics
+from fenics_contact.laws.base import Law, PointKinematics
 from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import global_max
 from fenics_contact.surface.fields import PointFields
@@ -88,8 +88,6 @@ class PresentPairs(Pairs):
     Attributes:
         felt: What laws see: "gap" (length), "normal", "slip" R (V - history) (length), "traction"
             from which the law's return map starts (stress).
-        told: "jump", the displacement relative to the partner since the last commit (length);
-            "turn I", rows of R; "committed", R times the committed traction (stress).
     """
 
     def __init__(
@@ -102,8 +100,6 @@ class PresentPairs(Pairs):
         d = self._gdim
         self._before = u.copy()
         self.felt = PointFields(quadrature, {"gap": 0, "normal": d, "slip": d, "traction": d})
-        turns = {f"turn {i}": d for i in range(d)}
-        self.told = PointFields(quadrature, {"jump": d, "committed": d} | turns)
         self._where: tuple[Array, Array] | None = None
         self._at_rest: tuple[Array, Array] | None = None
         self._committed: _Committed | None = None
@@ -167,22 +163,12 @@ class PresentPairs(Pairs):
         if self.number == 1:
             self._warn_of_unpaired(hits.reason)
         self._local = None
-        committed = np.zeros_like(normal)
-        if "traction" in history:
-            committed = self.turned(history.values("traction"))
-        turns = {f"turn {i}": rotation[:, i] for i in range(self._gdim)}
-        self.told.assign({"jump": self._jump_since(), "committed": committed} | turns)
 
-    def _jump_since(self) -> Array:
+    def jump_since(self) -> Array:
         """Displacement relative to the partner since the last commit, (n_points, d). Collective."""
-        change = self._u.x.petsc_vec.copy()
-        change.axpy(-1.0, self._before.x.petsc_vec)
-        product = self.jump_map.createVecLeft()
-        self.jump_map.mult(change, product)
-        jump = product.array_r.reshape(-1, self._gdim).copy()
-        for item in (change, product):
-            item.destroy()
-        return jump
+        change = self._u.copy()
+        change.x.array[:] -= self._before.x.array
+        return self._product(self.jump_map, change)
 
     def _feel(self, history: PointFields, traction: PointFields) -> None:
         """What laws see, by the tractions to start from as they are. Collective."""
@@ -211,10 +197,11 @@ class PresentPairs(Pairs):
         assert self._present is not None
         return self._present.way.copy()
 
-    def turned(self, vectors: Array) -> Array:
-        """Vectors of the committed bodies as they have turned since, (n_points, d)."""
+    def turned(self, vectors: Array, *, back: bool = False) -> Array:
+        """Vectors of the committed bodies as they have turned since, or back, (n_points, d)."""
         assert self._present is not None
-        return np.asarray(np.einsum("qij,qj->qi", self._present.rotation, vectors))
+        way = "qij,qi->qj" if back else "qij,qj->qi"
+        return np.asarray(np.einsum(way, self._present.rotation, vectors))
 
     def commit(self) -> None:
         """Make the present displacement the committed one."""
@@ -355,48 +342,28 @@ class PresentPairs(Pairs):
         return np.linalg.solve(trace[:, None, None] * unit - now.stretch, axial)
 
 
+@dataclass(frozen=True)
 class PresentKinematics:
-    """What laws see of `PresentPairs`, whose numbers stand for all that bodies do."""
+    """Numbers of `PresentPairs` stand for all that bodies do.
 
-    def __init__(self, pairs: PresentPairs, multipliers: PointFields | None) -> None:
-        """Take them.
+    Attributes:
+        multipliers: λ_n and λ_t, which take the place of committed tractions.
+    """
 
-        Args:
-            pairs: The pairs.
-            multipliers: λ_n and λ_t, which take the place of committed tractions.
-        """
-        self._told, self._multipliers = pairs.told, multipliers
+    multipliers: PointFields | None
 
-    def felt(self, jump: Any, law: Law, seen: Seen) -> PointKinematics:
+    def __call__(self, jump: Any, law: Law, seen: Seen) -> PointKinematics:
         """What a law sees of `PresentPairs.felt` (UFL)."""
         d = len(seen.normal)
-        gap = jump[0]
         normal, slip, start = (
             ufl.as_vector([jump[1 + part * d + i] for i in range(d)]) for part in range(3)
         )
         increment = traction = multiplier = None
-        if self._multipliers is not None:
-            multiplier = self._multipliers.ufl("pressure")
+        if self.multipliers is not None:
+            multiplier = self.multipliers.ufl("pressure")
         if law.has_friction:
             increment, traction = tangential(slip, normal), tangential(start, normal)
-        return PointKinematics(gap, normal, increment, increment, traction, multiplier)
-
-    def told(
-        self, jump: Any, law: Law, seen: Seen, felt: PointKinematics, response: ContactTraction
-    ) -> dict[str, Any]:
-        """What of it is told beside what laws see (UFL), by its name in `PointValues`."""
-        told = {"normal": felt.normal, "jump": self._told.ufl("jump")}
-        if law.has_friction:
-            told |= {
-                "framed_normal": self.framed(felt.normal),
-                "framed_traction": self.framed(response.traction),
-                "carried_traction": tangential(self._told.ufl("committed"), felt.normal),
-            }
-        return told
-
-    def framed(self, vector: Any) -> Any:
-        """A direction as the history has it (UFL): in the committed bodies."""
-        return combined(vector, [self._told.ufl(f"turn {i}") for i in range(len(vector))])
+        return PointKinematics(jump[0], normal, increment, increment, traction, multiplier)
 
 
 def _metric(vectors: Array) -> tuple[Array, Mask]:

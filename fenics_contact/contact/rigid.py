@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -15,6 +16,7 @@ from fenics_contact.contact.finite import (
     FiniteKinematics,
     Frame,
     SampledView,
+    carried_history,
     check_places,
     check_rigid,
     depends_on_place,
@@ -127,15 +129,11 @@ class MovingOpposite(Opposite):
         here = (place if at_rest is None else at_rest.at)(frame.into(x))
         placement = Placement(here.gap, frame.turned(here.direction))
         super().__init__(parts, parts.new_pairs(), jump, placement, at_rest)
-        exact = ExactView(
-            x,
-            frame,
-            place if self._moved is None else self._moved.at,
-            parts.history,
-            parts.multipliers,
-        )
-        turns, friction = frame.rotation is not None, parts.law.has_friction
-        self._view = SampledView(exact, quadrature, jump, turns=turns, friction=friction)
+        carried: dict[str, Any] = {}
+        if parts.law.has_friction:
+            carried = carried_history(x, frame, parts.history, parts.multipliers)
+        exact = ExactView(x, frame, place if self._moved is None else self._moved.at, carried)
+        self._view = SampledView(exact, quadrature, jump, parts.history)
         self.in_form = FiniteKinematics(exact, parts.multipliers)
         self.at_points = FiniteKinematics(self._view, parts.multipliers)
         self.sampler = _sampler(parts)
@@ -151,6 +149,19 @@ class MovingOpposite(Opposite):
         if self._moved is not None:
             self._moved.update()
         self._view.update()
+
+    def told(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
+        """See `Opposite`."""
+        view, normal, jump = self._view, self._view.values("normal"), self._view.values("relative")
+        told = {"normal": normal, "jump": jump}
+        if not self._parts.law.has_friction:
+            return told
+        framed = {"framed_normal": normal, "framed_traction": arrays["traction"]}
+        if "elastic_slip" in arrays:
+            framed["elastic_slip"] = arrays["elastic_slip"]
+        told |= {name: view.turned(vectors, back=True) for name, vectors in framed.items()}
+        way = view.turned(view.values("gap")[:, None] * normal, back=True)
+        return told | {"foot": jump + way, "carried_traction": view.values("committed traction")}
 
     def tangent(self, law: PointLaw) -> PointTangent:
         """See `Opposite`."""

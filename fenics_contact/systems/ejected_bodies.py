@@ -134,8 +134,7 @@ def _moved_opposite(full: FullSystem, change: Array) -> Array:
             length[bore] = np.abs(points.gap[bore])
         if opposite.is_rigid:
             # Within an iteration the values of the contact may be those of another state.
-            opposite.update()
-            relative = contact.acting.own.evaluate()["jump"] - opposite.committed_jump
+            relative = contact.states.evaluate_present().jump - opposite.committed_jump
             displacement = operator.jump(of_bodies) - opposite.turned(relative)
             length = np.maximum(length, np.linalg.norm(displacement, axis=1))
         found = np.maximum(found, scales.largest_at_points(number, length))
