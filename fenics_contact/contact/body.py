@@ -65,7 +65,7 @@ class BodyOpposite(Opposite):
     def deviation(self, values: PointValues) -> tuple[Array, Array]:
         """See `Opposite`."""
         gap, normal = self.true_placement(values)
-        linear = np.where(self.pairs.paired, self.pairs.linear_gap(values), 0.0)
+        linear = np.where(self.pairs.paired, self.pairs.linear_gap(values.normal), 0.0)
         return gap - linear, normal
 
     @property

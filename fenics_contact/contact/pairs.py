@@ -25,6 +25,7 @@ class PairsState:
     """Pairs as they are: see the attributes of `Pairs`."""
 
     jump_map: PETSc.Mat
+    opposite_map: PETSc.Mat | None
     paired: Mask
     n_unpaired: int
     distance: Array
@@ -40,6 +41,8 @@ class Pairs:
     Attributes:
         own_map: From ``u`` to the displacement of the points, (n_points gdim, n_dofs).
         jump_map: Likewise to that relative to what lies opposite; it changes with the pairs.
+        opposite_map: To the displacement of the places that normals met, not projected; None on a
+            rigid obstacle, and where pairs follow the bodies.
         paired: Which of this rank's points have an opposite, (n_points,).
         n_unpaired: Points without, on all ranks.
         number: How often opposites were found.
@@ -61,6 +64,7 @@ class Pairs:
         self._gdim = self._mesh.geometry.dim
         self.own_map = quadrature.interpolation_matrix(u.function_space)
         self.jump_map: PETSc.Mat = self.own_map
+        self.opposite_map: PETSc.Mat | None = None
         self.paired = np.ones(quadrature.n_points, dtype=np.bool_)
         self.n_unpaired = self.number = 0
         self.search: Pairing | None = None
@@ -84,7 +88,7 @@ class Pairs:
             u: Displacement in which to find them; None: the undeformed bodies.
         """
         assert self.search and self.distance and self.acts
-        opposite, distance, why = self.search.pair(x, normal, u, depth)
+        opposite, self.opposite_map, distance, why = self.search.pair(x, normal, u, depth)
         self.distance.x.array[: len(distance)] = np.nan_to_num(distance)
         self.distance.x.scatter_forward()
         self._set_pairs(opposite, ~np.isnan(distance))
@@ -127,17 +131,16 @@ class Pairs:
     def state(self) -> PairsState:
         """The pairs as they are; what is found later does not change it."""
         distance = np.zeros(0) if self.distance is None else self.distance.x.array.copy()
-        return PairsState(
-            self.jump_map, self.paired, self.n_unpaired, distance, self.found_at, self.found_jump
-        )
+        maps, found = (self.jump_map, self.opposite_map), (self.found_at, self.found_jump)
+        return PairsState(*maps, self.paired, self.n_unpaired, distance, *found)
 
     def set_state(self, state: PairsState) -> None:
         """Put back what `state` gave. Collective."""
         if self.jump_map is state.jump_map:
             return
         assert self.distance and self.acts
-        self.jump_map, self.paired = state.jump_map, state.paired
-        self.n_unpaired = state.n_unpaired
+        self.jump_map, self.opposite_map = state.jump_map, state.opposite_map
+        self.paired, self.n_unpaired = state.paired, state.n_unpaired
         self.found_at, self.found_jump = state.found_at, state.found_jump
         self.number += 1  # what was made of the pairs in between is of others
         self.distance.x.array[:] = state.distance
@@ -197,14 +200,17 @@ class Pairs:
         depth = self.depth(values.normal_displacement)
         return self.search.true_gap(values.x, self._u, depth)
 
-    def linear_gap(self, values: PointValues) -> Array:
-        """The gap between the pairs as they are, linearised where they were found. Collective."""
-        assert self.search is not None
-        return self.search.linear_gap(
-            values.x,
-            values.normal,
-            self.found_at,
-            self.depth(values.normal_displacement),
-            self._u,
-            self.own_displacement(),
-        )
+    def linear_gap(self, normal: Array) -> Array:
+        """Linearised gap with the displacement opposite as it is, not projected. Collective.
+
+        To compare with `true_gap`, which is of points as well.
+
+        Args:
+            normal: Unit normals of the undeformed Γc, (n_points, gdim).
+
+        Returns:
+            (n_points,) (length); of no meaning where there is no opposite.
+        """
+        assert self.distance and self.opposite_map
+        jump = self.own_displacement() - self._product(self.opposite_map, self._u)
+        return self.distance.x.array[: len(jump)] - np.sum(jump * normal, axis=1)

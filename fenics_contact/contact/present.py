@@ -218,9 +218,8 @@ class PresentPairs(Pairs):
 
     def state(self) -> PairsState:
         """See `Pairs.state`: all follows from the committed displacement."""
-        return PairsState(
-            self.jump_map, self.paired, self.n_unpaired, np.zeros(0), self._before.copy(), None
-        )
+        found = np.zeros(0), self._before.copy(), None
+        return PairsState(self.jump_map, None, self.paired, self.n_unpaired, *found)
 
     def set_state(self, state: PairsState) -> None:
         """See `Pairs.set_state`."""

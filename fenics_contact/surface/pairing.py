@@ -95,7 +95,7 @@ class Pairing:
 
     def pair(
         self, x: Array, normal: Array, u: fem.Function | None, penetration: Array
-    ) -> tuple[PETSc.Mat, Array, Any]:
+    ) -> tuple[PETSc.Mat, PETSc.Mat, Array, Any]:
         """Find the opposites of the points. Collective.
 
         Args:
@@ -105,9 +105,10 @@ class Pairing:
             penetration: Of the points as they have been paired, ≥ 0, (n_points,) (length).
 
         Returns:
-            G, (d n_points, n_dofs), and the distance s along the normal between the paired places
-            *in the undeformed bodies*, so that s - u_n is the present one; NaN without opposite.
-            And why there is none, one of `rays.REASONS`, (n_points,).
+            G, (d n_points, n_dofs); the same without projection, of the places that the normals
+            meet; and the distance s along the normal between the paired places *in the undeformed
+            bodies*, so that s - u_n is the present one; NaN without opposite. And why there is
+            none, one of `rays.REASONS`, (n_points,).
         """
         place = self.located(x)
         deep = self.largest(penetration)
@@ -127,20 +128,20 @@ class Pairing:
         facet = self._only_met(facet, other, share, pieces.facet)
         # Facets that are not covered, or some of whose points look past the other body, keep
         # the interpolation at their points.
-        kept = facet >= 0
-        good = np.bincount(facet[kept], minlength=len(self._here.cells)) > 0
-        good[facet[kept & (pieces.facet < 0)]] = False
+        cut = facet >= 0
+        good = np.bincount(facet[cut], minlength=len(self._here.cells)) > 0
+        good[facet[cut & (pieces.facet < 0)]] = False
         good[self._facet[~paired]] = False
         projection = self._projection(place, facet, places, weights, good)
         at_points, at_pieces = found.matrix(self._space), pieces.matrix(self._space)
         matrix = projection.matMult(at_pieces)
-        keep = at_points.createVecLeft()
+        keep, kept = at_points.createVecLeft(), at_points.copy()
         keep.array[:] = np.repeat(~good[self._facet], self._d)
-        at_points.diagonalScale(keep, None)
-        matrix.axpy(1.0, at_points, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        for item in (projection, at_pieces, at_points, keep):
+        kept.diagonalScale(keep, None)
+        matrix.axpy(1.0, kept, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        for item in (projection, at_pieces, kept, keep):
             item.destroy()
-        return matrix, gap, found.reason
+        return matrix, at_points, gap, found.reason
 
     def at_rest(self, place: Array, x: Array, normal: Array) -> tuple[Hits, Array]:
         """What the points meet in the undeformed bodies. Collective.
@@ -258,41 +259,6 @@ class Pairing:
         if self._place is None:
             self._place = self._here.locate(self._facet, x)
         return self._place
-
-    def linear_gap(
-        self,
-        x: Array,
-        along: Array,
-        at: fem.Function | None,
-        penetration: Array,
-        u: fem.Function,
-        own: Array,
-    ) -> Array:
-        """The linearised gap s - u_n with the displacement opposite as it is, not projected.
-
-        To compare with `true_gap`, which is of points as well. Collective.
-
-        Args:
-            x: The points in the undeformed body, (n_points, d).
-            along: Unit normals, (n_points, d).
-            at: Displacement at which pairs were found; none: in the undeformed bodies.
-            penetration: As for `pair`.
-            u: The displacement now.
-            own: Of the points, (n_points, d).
-
-        Returns:
-            (n_points,) (length), NaN where there is no opposite.
-        """
-        place = self.located(x)
-        deep = self.largest(penetration)
-        found = self.rays.follow(self._facet, place, along, at, deep)
-        matrix = found.matrix(self._space)
-        product = matrix.createVecLeft()
-        matrix.mult(u.x.petsc_vec, product)
-        jump = own - product.array_r.reshape(own.shape)
-        for item in (product, matrix):
-            item.destroy()
-        return np.asarray(np.sum((found.place - x - jump) * along, axis=1), dtype=np.float64)
 
     def _inside(self, x: Array, doubtful: Any) -> Any:
         """Which points of Γc lie in another undeformed body: (n_points,). Collective.
