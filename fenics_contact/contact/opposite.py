@@ -404,22 +404,6 @@ class Opposite(ABC):
         """By which the obstacle has turned since the last commit (radians). Collective."""
         return self.angle(values) - self.committed_angle
 
-    def carried(self, values: PointValues, traction: Array) -> tuple[Array, Array]:
-        """What an obstacle that has moved since a state would do to points that stuck. Collective.
-
-        Args:
-            values: Of that state, with ``u`` as it is now.
-            traction: Then, (n_points, gdim) (stress).
-
-        Returns:
-            The way from where they are to where it would have taken them, (n_points, gdim)
-            (length), and the traction, turned with it.
-
-        Raises:
-            ValueError: The opposite is a body.
-        """
-        raise ValueError(f"{self._parts.name}: the obstacle has no displacement")
-
     def turning_rate(self) -> Array:
         """Way by a unit angle of a turning obstacle's points where those of Γc are now. Collective.
 

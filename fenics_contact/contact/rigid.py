@@ -74,11 +74,6 @@ class RigidOpposite(Opposite):
         """See `Opposite`."""
         return self._parts.obstacle.is_flat and self._varying is None
 
-    def carried(self, values: PointValues, traction: Array) -> tuple[Array, Array]:
-        """See `Opposite`."""
-        self.update()
-        return self.data.values["shift"] - values.shift, traction
-
     def gradient_error(self, values: PointValues) -> Array:
         """See `Opposite`."""
         if self.sampler is not None:
@@ -179,16 +174,6 @@ class MovingOpposite(Opposite):
     def turned(self, vectors: Array) -> Array:
         """See `Opposite`: of the frame of the obstacle."""
         return self._view.turned(vectors)
-
-    def carried(self, values: PointValues, traction: Array) -> tuple[Array, Array]:
-        """See `Opposite`."""
-        self.update()
-        way = self.turned(values.jump - self._view.values("relative"))
-        rotation = self._parts.obstacle.rotation
-        if rotation is not None:
-            turn = self.angle() - self.angle(values)
-            traction = rotation.turned(traction, turn)
-        return way, traction
 
     def gradient_error(self, values: PointValues) -> Array:
         """See `Opposite`."""

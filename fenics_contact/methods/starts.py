@@ -295,9 +295,14 @@ class Starts:
             if global_max(comm, change / scales.size_at_points(number)) > NEGLIGIBLE:
                 return None
             if contact.rigid:
-                way, turned = opposite.carried(borne.values, traction)
-                moved = moved or global_max(comm, np.abs(way)) > 0.0
-                traction = turned - np.einsum("qij,qj->qi", borne.tangent.by_jump, way)
+                # An obstacle that has moved takes points that stuck along, and turns tractions.
+                now = contact.states.evaluate_present()
+                way = opposite.turned(borne.values.jump - now.jump)
+                length = np.linalg.norm(way, axis=1) / scales.size_at_points(number)
+                moved = moved or global_max(comm, length) > NEGLIGIBLE
+                turn_back = opposite.angle(borne.values) - opposite.angle(now)
+                traction = opposite.in_frame(traction, turn_back)
+                traction = traction - np.einsum("qij,qj->qi", borne.tangent.by_jump, way)
             tractions.append(traction)
         return tractions if moved else None
 
