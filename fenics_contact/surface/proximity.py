@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +15,7 @@ from fenics_contact.parallel import gather_rows
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.facets import FacetSet
 from fenics_contact.surface.projection import near_pairs
+from fenics_contact.surface.rays import Side
 from fenics_contact.tolerances import FLAT, NEGLIGIBLE, by_place
 from fenics_contact.types import Array, Index, Mask
 
@@ -53,46 +52,21 @@ class Neighbours:
 
 @dataclass(frozen=True)
 class _Facets:
-    """What is known of facets, one row each.
+    """The facets of all ranks, one row each.
 
     Attributes:
+        side: What is known of them.
         corners: In order around the facet, (n, n_corners, d).
         looks: Outward unit normal, (n, d).
-        height: Of its cell over it, (n,).
         label: Number of its body, (n,).
-        part: Of the connected part of the mesh, (n,).
-        vertices: Global numbers, (n, n_corners).
+        radius: Distance from the middle to the farthest corner, (n,).
     """
 
+    side: Side
     corners: Array
     looks: Array
-    height: Array
     label: Index
-    part: Index
-    vertices: Index
-
-    def of(self, rows: Index | Mask) -> _Facets:
-        """Some of them."""
-        return self._each(lambda values: values[rows])
-
-    def gathered(self, comm: MPI.Comm) -> _Facets:
-        """Those of all ranks, in the order of the ranks. Collective."""
-        return self._each(lambda values: gather_rows(comm, values))
-
-    def _each(self, change: Callable[[Any], Any]) -> _Facets:
-        changed: dict[str, Any] = {f.name: change(getattr(self, f.name)) for f in fields(self)}
-        return _Facets(**changed)
-
-    @property
-    def middle(self) -> Array:
-        """Of their corners, (n, d)."""
-        return self.corners.mean(axis=1)
-
-    @property
-    def diameter(self) -> Array:
-        """Twice the distance from the middle to the farthest corner, (n,)."""
-        away = np.linalg.norm(self.corners - self.middle[:, None], axis=2)
-        return 2 * away.max(axis=1, initial=0.0)
+    radius: Array
 
 
 def find_neighbours(
@@ -116,24 +90,19 @@ def find_neighbours(
     Returns:
         One item for each two bodies, in the order of their numbers: the same on all ranks.
     """
-    comm = space.mesh.comm
-    side = FacetSet(space, facets)
-    _, part = connected_bodies(space)
-    mine = _Facets(
-        side.moved_corners(None),
-        side.mean_normals(),
-        side.heights(),
-        np.asarray(label, dtype=np.int64),
-        part[space.dofmap.list[side.cells, 0]],
-        side.corner_vertices(),
-    )
-    kept: Mask = np.ones(len(facets), dtype=np.bool_)
+    comm, label = space.mesh.comm, np.asarray(label, dtype=np.int64)
     if not self_contact:
-        kept = _near_another(comm, mine, distance)
-    mine, own = mine.of(kept), facets[kept]
-    every = mine.gathered(comm)
-    first = comm.exscan(len(own)) or 0
-    pairs, away = _pairs(first + np.arange(len(own)), every, distance, self_contact=self_contact)
+        corners = FacetSet(space, facets).moved_corners(None)
+        near = _near_another(comm, corners, label, distance)
+        facets, label = facets[near], label[near]
+    mine = FacetSet(space, facets)
+    side = Side(mine, connected_bodies(space)[1])
+    corners = gather_rows(comm, mine.moved_corners(None))
+    looks, label = gather_rows(comm, mine.mean_normals()), np.concatenate(comm.allgather(label))
+    arms = np.linalg.norm(corners - side.middle[:, None], axis=2)
+    every = _Facets(side, corners, looks, label, arms.max(axis=1, initial=0.0))
+    first, diameter = side.first, 2 * every.radius
+    pairs, away = _pairs(first + np.arange(len(facets)), every, distance, self_contact=self_contact)
     pairs, away = np.concatenate(comm.allgather(pairs)), gather_rows(comm, away)
     # Every pair was found from both sides, but for round-off.
     one, other = every.label[pairs[:, 0]], every.label[pairs[:, 1]]
@@ -145,16 +114,15 @@ def find_neighbours(
     found = []
     for a, b in np.unique(both, axis=0):
         rows = np.all(both == (a, b), axis=1)
-        sides = _sides(pairs[rows], every.middle, same=bool(a == b))
+        sides = _sides(pairs[rows], side.middle, same=bool(a == b))
         far = np.full(len(every.label), np.inf)
         np.minimum.at(far, pairs[rows].ravel(), np.repeat(away[rows], 2))
         touched = np.union1d(*sides)
-        local = [s[(s >= first) & (s < first + len(own))] - first for s in sides]
-        diameter = every.diameter
+        local = [s[(s >= first) & (s < first + len(facets))] - first for s in sides]
         found.append(
             Neighbours(
                 (int(a), int(b)),
-                (np.sort(own[local[0]]), np.sort(own[local[1]])),
+                (np.sort(facets[local[0]]), np.sort(facets[local[1]])),
                 (len(sides[0]), len(sides[1])),
                 (float(diameter[sides[0]].mean()), float(diameter[sides[1]].mean())),
                 float(far[touched].min()),
@@ -165,19 +133,18 @@ def find_neighbours(
     return found
 
 
-def _near_another(comm: MPI.Comm, facets: _Facets, distance: float) -> Mask:
+def _near_another(comm: MPI.Comm, corners: Array, label: Index, distance: float) -> Mask:
     """Which facets are near the box of another body. Collective."""
-    n = comm.allreduce(int(facets.label.max(initial=-1)) + 1, op=MPI.MAX)
-    low, high = facets.corners.min(axis=1), facets.corners.max(axis=1)
-    d = facets.corners.shape[2]
-    boxes = np.full((2, n, d), np.inf)
-    np.minimum.at(boxes[0], facets.label, low)
-    np.minimum.at(boxes[1], facets.label, -high)
+    n = comm.allreduce(int(label.max(initial=-1)) + 1, op=MPI.MAX)
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    boxes = np.full((2, n, corners.shape[2]), np.inf)
+    np.minimum.at(boxes[0], label, low)
+    np.minimum.at(boxes[1], label, -high)
     comm.Allreduce(MPI.IN_PLACE, boxes, op=MPI.MIN)
     near = np.zeros(len(low), dtype=np.bool_)
     for body in range(n):
         gap = np.maximum(boxes[0, body] - high, low + boxes[1, body])
-        near |= (facets.label != body) & np.all(gap <= distance, axis=1)
+        near |= (label != body) & np.all(gap <= distance, axis=1)
     return near
 
 
@@ -188,7 +155,7 @@ def _pairs(
     pairs = [np.zeros((0, 2), dtype=np.int64)]
     distances: list[Array] = [np.zeros(0)]
     if len(every.label):
-        middle, radius = every.middle, every.diameter / 2
+        middle, radius = every.side.middle, every.radius
         tree = scipy.spatial.cKDTree(middle)
         for start in range(0, len(mine), _AT_ONCE):
             some = mine[start : start + _AT_ONCE]
@@ -209,13 +176,14 @@ def _pairs(
 
 def _in_front(every: _Facets, f: Index, g: Index) -> Mask:
     """Whether two facets lie in front of each other, or as deep as bodies may overlap."""
-    same = every.part[f] == every.part[g]
-    shared = every.vertices[f][:, :, None] == every.vertices[g][:, None, :]
-    deep = -_DEEP * np.maximum(every.height[f], every.height[g])
-    deep = np.where(same, -NEGLIGIBLE * every.diameter[f], deep)
+    side = every.side
+    same = side.body[f] == side.body[g]
+    shared = side.corners[f][:, :, None] == side.corners[g][:, None, :]
+    deep = -_DEEP * np.maximum(side.height[f], side.height[g])
+    deep = np.where(same, -2 * NEGLIGIBLE * every.radius[f], deep)
     front = ~(same & shared.any(axis=(1, 2)))
     for one, other in ((f, g), (g, f)):
-        arm = every.corners[other] - every.middle[one][:, None]
+        arm = every.corners[other] - side.middle[one][:, None]
         along = np.einsum("pkd,pd->pk", arm, every.looks[one]).max(axis=1, initial=-np.inf)
         front &= along >= deep
     return front
