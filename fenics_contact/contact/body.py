@@ -199,7 +199,7 @@ class FollowedOpposite(BodyOpposite):
 
     def tangent(self, law: PointLaw) -> PointTangent:
         """See `Opposite`."""
-        by_felt = law.evaluate_tangent({}).by_jump
+        by_felt = law.evaluate_tangent().by_jump
         traction = law.evaluate_traction()
         return PointTangent(self._present.tangent(by_felt, traction, self._parts.history))
 

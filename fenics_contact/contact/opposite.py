@@ -232,9 +232,6 @@ class Opposite(ABC):
         if given.shift is not None:
             expressions["obstacle"] = given.shift
             seen.append("obstacle")
-        for i, free in inputs.free_shift.items():
-            expressions |= {f"gap by {i}": ufl.diff(given.gap, free)}
-            expressions |= {f"normal by {i}": ufl.diff(given.normal, free)}
         data = PointData(parts.name, parts.quadrature, expressions, seen)
         sampled = Seen(
             data.ufl("initial_gap"),
@@ -250,18 +247,16 @@ class Opposite(ABC):
         Args:
             within: 1 at the points that the latter is confined to, 0 at others.
         """
-        law, quadrature, free = self._parts.law, self._parts.quadrature, self._free
-        felt, paired = self.felt, self.pairs.acts
+        law, quadrature, felt = self._parts.law, self._parts.quadrature, self.felt
+        # With finite kinematics all follows from X + u less the motion: derivatives do, too.
+        free = {} if self.is_finite else self._parts.inputs.free_shift
+        here: dict[str, Any] = {"given": self.given, "free": free}
+        paired = self.pairs.acts
         acts = within if paired is None else paired * within
         return (
-            PointLaw(law, self.given, self.in_form, quadrature, felt, acts=paired, free=free),
-            PointLaw(law, self.sampled, self.at_points, quadrature, felt, acts=acts, free=free),
+            PointLaw(law, self.given, self.in_form, quadrature, felt, acts=paired, **here),
+            PointLaw(law, self.sampled, self.at_points, quadrature, felt, acts=acts, **here),
         )
-
-    @property
-    def _free(self) -> list[int]:
-        """Unknown components of the obstacle's displacement that laws are differentiated by."""
-        return list(self._parts.inputs.free_motion)
 
     # ---- the points ------------------------------------------------------------------------------
 
@@ -320,9 +315,7 @@ class Opposite(ABC):
 
     def tangent(self, law: PointLaw) -> PointTangent:
         """Derivatives of a law's tractions where the points are. Collective."""
-        data = self.data.values
-        turns = {i: (data[f"gap by {i}"], data[f"normal by {i}"]) for i in self._free}
-        return law.evaluate_tangent(turns)
+        return law.evaluate_tangent()
 
     # ---- where it is -----------------------------------------------------------------------------
 

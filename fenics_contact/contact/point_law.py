@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -73,7 +73,8 @@ class PointLaw:
         jump: fem.Function,
         *,
         acts: Any,
-        free: Sequence[int],
+        given: Seen,
+        free: Mapping[int, Any],
     ) -> None:
         """Bind; nothing is compiled yet.
 
@@ -84,11 +85,12 @@ class PointLaw:
             quadrature: The points.
             jump: Displacement of the body at the points, of that opposite taken away.
             acts: 1 at points at which it acts, 0 at others (UFL); None: it acts at all.
-            free: Components of the obstacle's displacement that are unknown.
+            given: ``seen`` as expressions on Γc, which the derivatives by ``free`` are of.
+            free: Unknown components of the obstacle's displacement in these, `Inputs.free_shift`.
         """
         self.law, self.seen = law, seen
         self._kinematics, self._quadrature, self._jump = kinematics, quadrature, jump
-        self._acts, self._free = acts, list(free)
+        self._acts, self._given, self._free = acts, given, free
         self._gdim = quadrature.surface.mesh.geometry.dim
 
     def with_law(self, law: Law, parameters: Mapping[str, Any]) -> PointLaw:
@@ -100,6 +102,7 @@ class PointLaw:
             self._quadrature,
             self._jump,
             acts=self._acts,
+            given=self._given,
             free=self._free,
         )
 
@@ -150,44 +153,28 @@ class PointLaw:
     def _potential(self) -> PointEvaluator:
         return self._evaluator({"potential": self.potential()})
 
-    def evaluate_tangent(self, turns: Mapping[int, tuple[Array, Array]]) -> PointTangent:
-        """Derivatives of the traction. Collective.
-
-        Args:
-            turns: Of every free component of the obstacle's displacement the derivatives of gap
-                and normal by it, (n_points,) and (n_points, gdim).
-        """
-        rows, d = self._tangent(), self._gdim
-        by_jump = np.stack([rows[f"jump {i}"] for i in range(d)], axis=1)
+    def evaluate_tangent(self) -> PointTangent:
+        """Derivatives of the traction. Collective."""
+        rows, d = self._tangent(), range(self._gdim)
+        by_jump = np.stack([rows[f"jump {i}"] for i in d], axis=1)
         if not self._free:
             return PointTangent(by_jump)
-        by_normal = np.stack([rows[f"normal {i}"] for i in range(d)], axis=1)
-        by_obstacle = np.stack([rows[f"obstacle {i}"] for i in range(d)], axis=1)
-        by_shift = np.zeros_like(by_jump)
-        for i, (gap, normal) in turns.items():
-            by_shift[:, :, i] = by_obstacle[:, :, i]
-            by_shift[:, :, i] += rows["gap"] * gap[:, None]
-            by_shift[:, :, i] += np.einsum("qij,qj->qi", by_normal, normal)
-        return PointTangent(by_jump, by_shift)
+        columns, none = self._by_shift(), np.zeros(by_jump.shape[:2])
+        return PointTangent(by_jump, np.stack([columns.get(str(i), none) for i in d], axis=2))
 
     @cached_property
     def _tangent(self) -> PointEvaluator:
-        """By the jump; where the obstacle moves freely by its displacement, the normal, the gap."""
-        seen, jump = self.seen, ufl.variable(self._jump)
-        by = {"jump": jump}
-        if self._free:
-            by |= {"normal": ufl.variable(seen.normal), "obstacle": ufl.variable(seen.shift)}
-            by |= {"gap": ufl.variable(seen.gap)}
-            seen = replace(seen, gap=by["gap"], normal=by["normal"], shift=by["obstacle"])
-        traction = self.traction(jump, seen)
-        rows: dict[str, Any] = {}
-        for name, variable in by.items():
-            derivative = ufl.diff(traction, variable)
-            if name == "gap":
-                rows[name] = derivative
-            else:
-                rows |= {f"{name} {i}": derivative[i, :] for i in range(self._gdim)}
-        return self._evaluator(rows)
+        jump = ufl.variable(self._jump)
+        rows = ufl.diff(self.traction(jump), jump)
+        return self._evaluator({f"jump {i}": rows[i, :] for i in range(self._gdim)})
+
+    @cached_property
+    def _by_shift(self) -> PointEvaluator:
+        """By the free displacement of the obstacle, in its own expressions."""
+        seen = replace(self._given, parameters=self.seen.parameters)
+        traction = self.traction(self._jump, seen)
+        columns = {str(i): ufl.diff(traction, shift) for i, shift in self._free.items()}
+        return PointEvaluator(self._quadrature, columns)
 
     def evaluate_yield(self) -> tuple[Array, Array]:
         """The law's yield functions and their gradients. Collective.

@@ -133,11 +133,6 @@ class MovingOpposite(Opposite):
         self.at_points = FiniteKinematics(self._view, parts.multipliers)
         self.sampler = _sampler(parts)
 
-    @property
-    def _free(self) -> list[int]:
-        """None: where all follows from X + u less the motion of the obstacle, so do derivatives."""
-        return []
-
     def update(self) -> None:
         """See `Opposite`."""
         super().update()
