@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import basix
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse.csgraph
@@ -27,25 +26,13 @@ def connected_bodies(space: fem.FunctionSpace) -> tuple[int, npt.NDArray[np.intp
     comm, dofmap = space.mesh.comm, space.dofmap
     n_owned = dofmap.index_map.size_local
     n_nodes = n_owned + dofmap.index_map.num_ghosts
-    # Cells that share a node share a vertex.
-    n_vertices = len(basix.topology(basix.CellType[space.mesh.topology.cell_name()])[0])
-    vertices = [dofmap.dof_layout.entity_dofs(0, i)[0] for i in range(n_vertices)]
-    cells = dofmap.list[:, vertices]
-    is_vertex = np.zeros(n_nodes, dtype=np.bool_)
-    is_vertex[cells] = True
-    number = np.cumsum(is_vertex) - 1
-    n = int(np.count_nonzero(is_vertex))
-    first = np.repeat(number[cells[:, 0]], n_vertices - 1)
+    cells = dofmap.list
+    first = np.repeat(cells[:, 0], cells.shape[1] - 1)
     links = scipy.sparse.coo_matrix(
-        (np.ones(first.size, dtype=np.int8), (first, number[cells[:, 1:]].ravel())), (n, n)
+        (np.ones(first.size, dtype=np.int8), (first, cells[:, 1:].ravel())), (n_nodes, n_nodes)
     )
-    n_parts, of_vertex = scipy.sparse.csgraph.connected_components(links, directed=False)
-    part = np.full(n_nodes, -1, dtype=np.int64)
-    part[dofmap.list] = of_vertex[number[cells[:, :1]]]
     # Nodes that no cell here has, all of them ghosts, are parts of their own.
-    alone = part < 0
-    part[alone] = n_parts + np.arange(np.count_nonzero(alone))
-    n_parts += int(np.count_nonzero(alone))
+    n_parts, part = scipy.sparse.csgraph.connected_components(links, directed=False)
     offset = comm.scan(n_parts) - n_parts
     # A ghost belongs to a part here and to one on its owner: the two are one body.
     label = fem.Function(space)
