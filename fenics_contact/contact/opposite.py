@@ -422,11 +422,16 @@ class Opposite(ABC):
 
     def in_frame(self, vectors: Array, angle: float) -> Array:
         """Vectors in the frame of the obstacle turned by an angle since it began, (n, gdim)."""
-        return vectors
+        rotation = self._parts.obstacle.rotation
+        return vectors if rotation is None else rotation.turned(vectors, -angle)
 
     def rotation_in_increment(self, values: PointValues) -> IncrementalRotation:
         """Rotation of the obstacle since the last commit. Collective."""
-        return IncrementalRotation()
+        rotation = self._parts.obstacle.rotation
+        if rotation is None:
+            return IncrementalRotation()
+        about = values.arrays["about"][:1]  # the same at all points
+        return IncrementalRotation(self.turned_by(values), about, rotation)
 
     def largest_curvature(self) -> Array | None:
         """Largest principal curvature of a rigid obstacle at X + u, (n_points,) (1/length).

@@ -24,7 +24,7 @@ from fenics_contact.contact.finite import (
 )
 from fenics_contact.contact.inputs import varies
 from fenics_contact.contact.obstacle_sampler import ObstacleSampler
-from fenics_contact.contact.opposite import IncrementalRotation, Opposite, Parts
+from fenics_contact.contact.opposite import Opposite, Parts
 from fenics_contact.contact.point_law import PointLaw, PointTangent
 from fenics_contact.contact.sampled import SampledPlaces
 from fenics_contact.contact.values import PointValues
@@ -186,19 +186,6 @@ class MovingOpposite(Opposite):
         known = np.isfinite(curvature).all(axis=(1, 2))
         largest[known] = np.linalg.eigvalsh(curvature[known]).max(axis=1, initial=0.0)
         return largest
-
-    def in_frame(self, vectors: Array, angle: float) -> Array:
-        """See `Opposite`."""
-        rotation = self._parts.obstacle.rotation
-        return vectors if rotation is None else rotation.turned(vectors, -angle)
-
-    def rotation_in_increment(self, values: PointValues) -> IncrementalRotation:
-        """See `Opposite`."""
-        rotation, angle = self._parts.obstacle.rotation, self.turned_by(values)
-        if rotation is None:
-            return super().rotation_in_increment(values)
-        about = values.arrays["about"][:1]  # the same at all points
-        return IncrementalRotation(angle, about, rotation)
 
     def feet(self, values: PointValues) -> dict[str, Array]:
         """See `Opposite`."""
