@@ -13,10 +13,9 @@ from fenics_contact.arguments import check_instance
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.acting import ActingLaw
 from fenics_contact.contact.choices import enforcement_of, kind_of_opposite
-from fenics_contact.contact.inputs import FreeMotion, Inputs, varies
+from fenics_contact.contact.inputs import Inputs, varies
 from fenics_contact.contact.multipliers import Multipliers, TraceProjection
 from fenics_contact.contact.opposite import Opposite, Parts
-from fenics_contact.contact.pairs import Pairs
 from fenics_contact.contact.results import PointResults
 from fenics_contact.contact.states import ContactStates
 from fenics_contact.contact.values import PointValues
@@ -90,10 +89,23 @@ class Contact(PointResults):
         entity_maps: Entity maps with which to compile `form`.
         name: Name in messages and files.
         inputs: Data of law, obstacle and contact, as UFL.
+        parameters: The parameters of law and obstacle that were given by numbers, as
+            ``fem.Constant``, by name ("friction", "k_n", "displacement" …); set ``.value`` to
+            change one. The value of a `RelativeStiffness` is the multiple of E/h.
+        free_motion: Unknown components of the obstacle's displacement, by number of the component.
+            The values of these scalar constants are results (length).
+        applied_force: Given forces on the obstacle (force), by number of the component.
+        free_angle: Unknown rotation angle of the obstacle, a result (radians); None if it is not
+            free.
+        applied_moment: Given moment on the obstacle (force times length); None if its angle is not
+            free.
+        motions: All unknown motions of the obstacle: displacements, then the angle.
         gap_prescribed: Whether the initial gap was given by ``gap``.
         kinematics: The argument.
         finite: Whether the kinematics are finite.
         opposite: The contact kinematics, those of the obstacle or the opposing body.
+        rigid: Whether the obstacle is rigid, so that its reactions are external forces.
+        pairs: The pairs of points of Γc and opposite points.
         acting: The law evaluated at the points.
         states: The committed state, and the results evaluated last.
 
@@ -174,6 +186,10 @@ class Contact(PointResults):
         )
         if modulus is not None:
             self.inputs.set_modulus(modulus)
+        inputs = self.inputs
+        self.parameters, self.motions = inputs.constants, inputs.motions
+        self.free_motion, self.applied_force = inputs.free_motion, inputs.applied_force
+        self.free_angle, self.applied_moment = inputs.free_angle, inputs.applied_moment
         self.gap_prescribed = gap is not None
 
         fields = {"opening": 0, "penetration": 0, "normal_traction": 0}
@@ -198,6 +214,7 @@ class Contact(PointResults):
             multipliers=None if self.multipliers is None else self.multipliers.fields,
         )
         self.opposite: Opposite = opposite_kind(parts)
+        self.rigid, self.pairs = self.opposite.is_rigid, self.opposite.pairs
         self.acting = ActingLaw(parts, self.opposite)
         if not self.rigid:
             self.opposite.update()
@@ -303,43 +320,6 @@ class Contact(PointResults):
 
     # ---- data ------------------------------------------------------------------------------------
 
-    @property
-    def parameters(self) -> dict[str, fem.Constant]:
-        """The parameters of law and obstacle that were given by numbers, as ``fem.Constant``.
-
-        They are sorted by name ("friction", "k_n", "displacement" …); set ``.value`` to change one.
-        The value of a `RelativeStiffness` is the multiple of E/h.
-        """
-        return self.inputs.constants
-
-    @property
-    def free_motion(self) -> dict[int, fem.Constant]:
-        """Unknown components of the obstacle's displacement, by number of the component.
-
-        The values of these scalar constants are results (length).
-        """
-        return self.inputs.free_motion
-
-    @property
-    def applied_force(self) -> dict[int, Any]:
-        """Given forces on the obstacle (force), by number of the component."""
-        return self.inputs.applied_force
-
-    @property
-    def free_angle(self) -> fem.Constant | None:
-        """Unknown rotation angle of the obstacle, a result (radians); None if it is not free."""
-        return self.inputs.free_angle
-
-    @property
-    def applied_moment(self) -> fem.Constant | None:
-        """Given moment on the obstacle (force times length); None if its angle is not free."""
-        return self.inputs.applied_moment
-
-    @property
-    def motions(self) -> list[FreeMotion]:
-        """All unknown motions of the obstacle: displacements, then the angle."""
-        return self.inputs.motions
-
     def check_input(self) -> None:
         """Check that all parameters are finite and in range at every point of Γc. Collective.
 
@@ -353,16 +333,6 @@ class Contact(PointResults):
         self.inputs.check(self.opposite.data.values, undeformed=not self.finite)
 
     # ---- pairs -----------------------------------------------------------------------------------
-
-    @property
-    def rigid(self) -> bool:
-        """Whether the obstacle is rigid, so that its reactions are external forces."""
-        return self.opposite.is_rigid
-
-    @property
-    def pairs(self) -> Pairs:
-        """The pairs of points of Γc and opposite points."""
-        return self.opposite.pairs
 
     @property
     def paired(self) -> Mask:
