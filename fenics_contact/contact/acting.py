@@ -14,6 +14,8 @@ __all__ = ["ActingLaw"]
 class ActingLaw:
     """A law at the points, where they are now; results of the contact stay as they are.
 
+    The constructor is collective, and compiles what evaluates all of the law.
+
     Attributes:
         own: The law itself, at numbers at the points.
         in_form: The same as expressions on Γc.
@@ -21,12 +23,6 @@ class ActingLaw:
     """
 
     def __init__(self, parts: Parts, opposite: Opposite) -> None:
-        """Compile what evaluates all of it. Collective.
-
-        Args:
-            parts: Of the contact.
-            opposite: What its points feel.
-        """
         law, quadrature = parts.law, parts.quadrature
         self._law, self._opposite, self._quadrature = law, opposite, quadrature
         self._within = fem.Function(quadrature.space(), name="within")

@@ -29,17 +29,15 @@ NEGLIGIBLE_SLIDE = 1e-2
 
 
 class BodyOpposite(Opposite):
-    """Another body, paired with the points of the undeformed bodies, or of deformed ones."""
+    """Another body, paired with the points of the undeformed bodies, or of deformed ones.
+
+    Args:
+        pairs: Pairs of the points; by default such as stay.
+    """
 
     is_rigid = False
 
     def __init__(self, parts: Parts, pairs: Pairs | None = None) -> None:
-        """Collect both surfaces. Collective.
-
-        Args:
-            parts: Of the contact.
-            pairs: Of the points; by default such as stay.
-        """
         pairs = pairs or parts.new_pairs()
         assert pairs.distance is not None
         normal = ufl.FacetNormal(parts.quadrature.surface.mesh)
@@ -166,7 +164,6 @@ class FollowedOpposite(BodyOpposite):
     follows = True
 
     def __init__(self, parts: Parts) -> None:
-        """Collect both surfaces. Collective."""
         obstacle = parts.obstacle
         assert isinstance(obstacle, DeformableBody)
         pairs = PresentPairs(parts.name, parts.displacement.u, parts.quadrature, obstacle)

@@ -20,18 +20,16 @@ _NO_DISTANCE = 0.5
 
 
 class DeformedPlaces:
-    """Gap and normal of a rigid obstacle at X + u instead of X; compiled when first called."""
+    """Gap and normal of a rigid obstacle at X + u instead of X; compiled when first called.
+
+    Args:
+        displacement: u at the points.
+        placement: Of the obstacle, seen from X, but displaced as it is where X has moved to.
+    """
 
     def __init__(
         self, quadrature: SurfaceQuadrature, displacement: fem.Function, placement: Placement
     ) -> None:
-        """Bind.
-
-        Args:
-            quadrature: The points.
-            displacement: u at the points.
-            placement: Of the obstacle, seen from X, but displaced as it is where X has moved to.
-        """
         self._quadrature, self._displacement, self._placement = quadrature, displacement, placement
         self._evaluate: PointEvaluator | None = None
 
@@ -58,14 +56,14 @@ class VaryingMotion:
     """A prescribed displacement w of an obstacle that varies along Γc.
 
     It turns and stretches the surface of the obstacle: a tangent t becomes t + ∇w t, so that the
-    normal is along n - ∇wᵀ n, to first order, with the derivatives of w along the surface.
+    normal is along n - ∇wᵀ n, to first order, with the derivatives of w along the surface. The
+    constructor is collective.
 
     Attributes:
         moved: w where the points have moved to, w + ∇w u (UFL), as of the last `update`.
     """
 
     def __init__(self, quadrature: SurfaceQuadrature) -> None:
-        """Take the points. Collective."""
         self._rows = quadrature.point_rows
         d = quadrature.surface.mesh.geometry.dim
         self._fields = PointFields(quadrature, {"moved": d})

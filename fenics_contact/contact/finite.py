@@ -152,7 +152,11 @@ class SampledView:
 
     Laws are compiled for numbers at points, and serve every obstacle. Gap and normal are linear
     about the displacement that they were sampled at, so that the first derivatives of tractions
-    are exact, too, curvature of the obstacle included.
+    are exact, too, curvature of the obstacle included. The constructor is collective.
+
+    Args:
+        jump: Displacement of the body there.
+        history: The committed state, vectors in the frame of the obstacle.
     """
 
     def __init__(
@@ -162,14 +166,6 @@ class SampledView:
         jump: fem.Function,
         history: PointFields,
     ) -> None:
-        """Compile. Collective.
-
-        Args:
-            exact: What to sample.
-            quadrature: The points.
-            jump: Displacement of the body there.
-            history: The committed state, vectors in the frame of the obstacle.
-        """
         d, frame = quadrature.surface.mesh.geometry.dim, exact.frame
         moved = ufl.variable(jump)
         seen = exact(moved)

@@ -81,10 +81,16 @@ class FreeMotion:
 class Inputs:
     """Weight, parameters of the law and displacement of the obstacle, as UFL.
 
+    The constructor is collective.
+
+    Args:
+        accuracy: Determines the stiffness where the user does not.
+        opposite: This rank's facets of the other body; None: the obstacle is rigid.
+
     Attributes:
         constants: Every parameter given by a number, by name; see `Contact.parameters`.
         stiffness_factor: Factor of k_n and k_t.
-        weight: Factor of the surface measure.
+        weight: Factor of the surface measure, 1 by default.
         law: Parameters of the law, by name.
         shift: Displacement of the obstacle; None: it has none.
         rotation: Matrix of its turn, and a point of the axis; None: it does not turn.
@@ -96,6 +102,10 @@ class Inputs:
         free_angle: That of the turn, where it is unknown; else None.
         applied_moment: What turns it then.
         motions: All unknowns of the obstacle, displacements first.
+
+    Raises:
+        ValueError: A number is out of range, or a shape is wrong.
+        TypeError: Something is neither number nor UFL.
     """
 
     def __init__(
@@ -109,21 +119,6 @@ class Inputs:
         accuracy: Accuracy | None,
         opposite: Indices | None,
     ) -> None:
-        """Take them over. Collective.
-
-        Args:
-            name: Of the contact, in messages.
-            quadrature: The points.
-            law: Whose parameters are wanted.
-            obstacle: Whose displacement is.
-            weight: Factor of the surface measure; None: 1.
-            accuracy: Says the stiffness where the user does not.
-            opposite: This rank's facets of the other body; None: the obstacle is rigid.
-
-        Raises:
-            ValueError: A number is out of range, or a shape is wrong.
-            TypeError: Something is neither number nor UFL.
-        """
         self._name, self._law, self._quadrature = name, law, quadrature
         self._surface, self._accuracy = quadrature.surface, accuracy
         self._gdim = self._surface.mesh.geometry.dim

@@ -52,16 +52,14 @@ class TraceProjection:
     """The function of a degree on Γc that is closest to values at the points, at these points.
 
     Closest in the mean square over Γc by its quadrature; continuous. Where the points are too few
-    to tell the functions apart it is one of the closest, which have the same values there.
+    to tell the functions apart it is one of the closest, which have the same values there. The
+    constructor is collective.
+
+    Args:
+        degree: Of the displacement element; that of the functions is one less, and at least 1.
     """
 
     def __init__(self, quadrature: SurfaceQuadrature, degree: int) -> None:
-        """Tabulate the functions. Collective.
-
-        Args:
-            quadrature: The points.
-            degree: Of the displacement element; that of the functions is one less, and at least 1.
-        """
         trace = ("Lagrange", max(1, degree - 1))
         space = fem.functionspace(quadrature.surface.submesh, trace)
         self._basis = quadrature.interpolation_matrix(space)
@@ -90,7 +88,13 @@ class TraceProjection:
 
 
 class Multipliers:
-    """λ_n and λ_t at the points of a contact.
+    """λ_n and λ_t at the points of a contact, zero at first.
+
+    The constructor is collective.
+
+    Args:
+        degree: Degree of the displacement element.
+        turning: Whether normals turn.
 
     Attributes:
         fields: "pressure" λ_n and, with friction, "traction" λ_t (stress), in the frame of the
@@ -102,14 +106,6 @@ class Multipliers:
     def __init__(
         self, quadrature: SurfaceQuadrature, degree: int, law: Law, *, turning: bool
     ) -> None:
-        """Zeros. Collective.
-
-        Args:
-            quadrature: The points.
-            degree: Of the displacement element.
-            law: Of the contact.
-            turning: Whether normals turn.
-        """
         self._comm = quadrature.surface.mesh.comm
         self._law = law
         vectors = ["traction", "normal"] if turning else ["traction"]

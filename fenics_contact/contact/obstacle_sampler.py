@@ -28,6 +28,11 @@ class ObstacleSampler:
 
     The obstacle's shape depends on the constants in its distance, which may change from one
     increment to the next; between the committed shape and the present one they go straight on.
+
+    Args:
+        quadrature: The points of Γc, whose function space the compiled form uses.
+        obstacle: Gap and direction at a place in the obstacle's frame (UFL), or the obstacle
+            itself where it is known in numbers.
     """
 
     def __init__(
@@ -35,13 +40,6 @@ class ObstacleSampler:
         quadrature: SurfaceQuadrature,
         obstacle: Callable[[Any], Placement] | SampledObstacle,
     ) -> None:
-        """Bind the obstacle, and commit its shape.
-
-        Args:
-            quadrature: The points of Γc, whose function space the compiled form uses.
-            obstacle: Gap and direction at a place in the obstacle's frame (UFL), or the obstacle
-                itself where it is known in numbers.
-        """
         self._quadrature, self._obstacle = quadrature, obstacle
         self._comm = quadrature.surface.mesh.comm
         self._constants: list[Any] = []

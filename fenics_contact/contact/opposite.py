@@ -134,6 +134,11 @@ class Opposite(ABC):
     """What lies opposite Γc, under one kinematics.
 
     The ``values`` that methods take are those of the last evaluation where nothing else is said.
+    Constructors are collective, and compile what samples the points.
+
+    Args:
+        placement: Where the opposite is, seen from the undeformed Γc.
+        at_rest: Of an obstacle known in numbers, what has to be sampled for that.
 
     Attributes:
         pairs: What lies opposite each of the points.
@@ -168,15 +173,6 @@ class Opposite(ABC):
         placement: Placement,
         at_rest: SampledPlaces | None = None,
     ) -> None:
-        """Compile what samples the points. Collective.
-
-        Args:
-            parts: Of the contact.
-            pairs: Of the points.
-            jump: A function at the points, for the displacement there.
-            placement: Where the opposite is, seen from the undeformed Γc.
-            at_rest: Of an obstacle known in numbers, what has to be sampled for that.
-        """
         self.pairs, self.jump = pairs, jump
         self._parts, self._at_rest = parts, at_rest
         self._mesh = parts.quadrature.surface.mesh

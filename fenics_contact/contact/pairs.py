@@ -36,7 +36,8 @@ class PairsState:
 class Pairs:
     """Opposites of the points, and the sparse map from displacements to jumps at the points.
 
-    On a rigid obstacle there is nothing to find, and every point has its opposite.
+    On a rigid obstacle there is nothing to find, and every point has its opposite. The constructor
+    is collective, and collects the surfaces; `find` finds the pairs.
 
     Attributes:
         own_map: From ``u`` to the displacement of the points, (n_points gdim, n_dofs).
@@ -58,7 +59,6 @@ class Pairs:
     def __init__(
         self, name: str, u: fem.Function, quadrature: SurfaceQuadrature, obstacle: Obstacle
     ) -> None:
-        """Collect the surfaces; `find` finds the pairs. Collective."""
         self._name, self._u, self._quadrature = name, u, quadrature
         self._mesh = quadrature.surface.mesh
         self._gdim = self._mesh.geometry.dim

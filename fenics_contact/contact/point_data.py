@@ -24,8 +24,17 @@ __all__ = ["PointData"]
 class PointData:
     """Named expressions at the points of Γc, and some of them as functions for the laws.
 
+    The constructor is collective, and compiles them.
+
+    Args:
+        expressions: Scalars and vectors by name.
+        seen: Names of those that laws see.
+
     Attributes:
         values: All of them, (n_points,) or (n_points, d), as sampled by the last `update`.
+
+    Raises:
+        ValueError: One of them cannot be compiled; it says which. On all ranks.
     """
 
     def __init__(
@@ -35,17 +44,6 @@ class PointData:
         expressions: Mapping[str, ufl.core.expr.Expr],
         seen: Iterable[str],
     ) -> None:
-        """Compile. Collective.
-
-        Args:
-            name: Of the contact, in messages.
-            quadrature: The points.
-            expressions: Scalars and vectors by name.
-            seen: Names of those that laws see.
-
-        Raises:
-            ValueError: One of them cannot be compiled; it says which. On all ranks.
-        """
         self._comm = quadrature.surface.mesh.comm
         try:
             self._evaluate = PointEvaluator(quadrature, expressions)

@@ -57,7 +57,14 @@ class PointTangent:
 
 
 class PointLaw:
-    """What a law makes of displacements at the points.
+    """What a law makes of displacements at the points, compiled when first asked for.
+
+    Args:
+        kinematics: What the law sees of displacements.
+        jump: Displacement of the body at the points, of that opposite taken away.
+        acts: 1 at points at which it acts, 0 at others (UFL); None: it acts at all.
+        given: ``seen`` as expressions on Γc, which the derivatives by ``free`` are of.
+        free: Unknown components of the obstacle's displacement in these, `Inputs.free_shift`.
 
     Attributes:
         law: The law.
@@ -76,18 +83,6 @@ class PointLaw:
         given: Seen,
         free: Mapping[int, Any],
     ) -> None:
-        """Bind; nothing is compiled yet.
-
-        Args:
-            law: The law.
-            seen: What it sees of the points apart from displacements.
-            kinematics: What it sees of these.
-            quadrature: The points.
-            jump: Displacement of the body at the points, of that opposite taken away.
-            acts: 1 at points at which it acts, 0 at others (UFL); None: it acts at all.
-            given: ``seen`` as expressions on Γc, which the derivatives by ``free`` are of.
-            free: Unknown components of the obstacle's displacement in these, `Inputs.free_shift`.
-        """
         self.law, self.seen = law, seen
         self._kinematics, self._quadrature, self._jump = kinematics, quadrature, jump
         self._acts, self._given, self._free = acts, given, free

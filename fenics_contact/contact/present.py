@@ -85,6 +85,8 @@ class _Present:
 class PresentPairs(Pairs):
     """Pairs that follow the bodies: found anew wherever the displacement has changed.
 
+    The constructor is collective, and collects the surfaces; `follow` finds the pairs.
+
     Attributes:
         felt: What laws see: "gap" (length), "normal", "slip" R (V - history) (length), "traction"
             from which the law's return map starts (stress).
@@ -93,7 +95,6 @@ class PresentPairs(Pairs):
     def __init__(
         self, name: str, u: fem.Function, quadrature: SurfaceQuadrature, obstacle: DeformableBody
     ) -> None:
-        """Collect the surfaces; `follow` finds the pairs. Collective."""
         super().__init__(name, u, quadrature, obstacle)
         assert self.search is not None
         self._rays = self.search.rays

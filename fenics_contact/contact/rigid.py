@@ -36,14 +36,13 @@ __all__ = ["MovingOpposite", "RigidOpposite"]
 
 
 class RigidOpposite(Opposite):
-    """A rigid obstacle, seen from the undeformed Γc."""
+    """A rigid obstacle, seen from the undeformed Γc.
+
+    Raises:
+        ValueError: Data of a `SampledObstacle` do not fit.
+    """
 
     def __init__(self, parts: Parts) -> None:
-        """Place it. Collective.
-
-        Raises:
-            ValueError: Data of a `SampledObstacle` do not fit.
-        """
         x, jump = ufl.SpatialCoordinate(parts.quadrature.surface.mesh), parts.new_jump()
         shift = parts.inputs.shift
         frame = moved = Frame(shift, None)
@@ -99,16 +98,15 @@ class RigidOpposite(Opposite):
 
 
 class MovingOpposite(Opposite):
-    """A rigid obstacle that may move and turn by any amount, seen from where Γc is now."""
+    """A rigid obstacle that may move and turn by any amount, seen from where Γc is now.
+
+    Raises:
+        ValueError: Its place is not known everywhere, or it is not rigid.
+    """
 
     is_finite = True
 
     def __init__(self, parts: Parts) -> None:
-        """Place it, and see it from moving points. Collective.
-
-        Raises:
-            ValueError: Its place is not known everywhere, or it is not rigid.
-        """
         inputs, quadrature = parts.inputs, parts.quadrature
         mesh = quadrature.surface.mesh
         frame, jump = Frame(inputs.shift, inputs.rotation), parts.new_jump()

@@ -21,19 +21,15 @@ class SampledPlaces:
 
     The expansion is of second order, so that gap and normal are exact there, and their derivatives:
     what is solved with it is solved for the obstacle itself, as long as `update` is called where
-    places have changed.
+    places have changed. The constructor is collective; `update` samples.
+
+    Args:
+        place: Where the points are, seen from the obstacle, (gdim,) (UFL, length).
     """
 
     def __init__(
         self, quadrature: SurfaceQuadrature, obstacle: SampledObstacle, place: Any
     ) -> None:
-        """Compile; `update` samples. Collective.
-
-        Args:
-            quadrature: The points.
-            obstacle: To sample.
-            place: Where the points are, seen from the obstacle, (gdim,) (UFL, length).
-        """
         d = obstacle.gdim
         self._obstacle, self._comm = obstacle, quadrature.surface.mesh.comm
         self._evaluate = PointEvaluator(quadrature, {"place": place})

@@ -58,6 +58,8 @@ class ContactTrial:
 class ContactStates:
     """The committed state of a contact, and what is evaluated from it at the present ``u``.
 
+    It begins at the ``u`` at construction, which is collective.
+
     Attributes:
         committed: The committed state.
         history: Its history variables, of which an increment may count slip from elsewhere.
@@ -70,14 +72,6 @@ class ContactStates:
         opposite: Opposite,
         acting: ActingLaw,
     ) -> None:
-        """Begin at the present ``u``. Collective.
-
-        Args:
-            parts: Of the contact.
-            multipliers: Of the augmented Lagrangian method.
-            opposite: The contact kinematics.
-            acting: The law evaluated at the points.
-        """
         self.history = history = parts.history
         self._name, self._law, self._multipliers = parts.name, parts.law, multipliers
         self._opposite, self._acting = opposite, acting

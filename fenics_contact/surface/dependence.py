@@ -13,17 +13,16 @@ __all__ = ["Dependence"]
 
 
 class Dependence:
-    """Whether any of the numbers that a form depends on was changed since they were last noted."""
+    """Whether any of the numbers that a form depends on was changed since they were last noted.
+
+    Args:
+        constants: Constants of the form.
+        coefficients: Coefficients of the form, without those that may change as they will.
+    """
 
     def __init__(
         self, constants: Sequence[fem.Constant], coefficients: Sequence[fem.Function]
     ) -> None:
-        """Nothing is noted yet.
-
-        Args:
-            constants: Of the form.
-            coefficients: Of the form, without those that may change as they will.
-        """
         # Views stay valid as long as what they are of.
         self._owners = (tuple(constants), tuple(coefficients))
         self._views = [np.ravel(c.value) for c in constants] + [f.x.array for f in coefficients]

@@ -30,6 +30,14 @@ _MIXED = 'mixed_element([element("P", cell, 2, shape=(gdim,)), element("P", cell
 class Displacement:
     """A displacement, and the function that is solved for.
 
+    The constructor is collective.
+
+    Args:
+        u: A vector-valued Lagrange function, or the part of a mixed one that is such, as
+            ``ufl.split`` gives it; parts that are bubbles may be added.
+        mesh: That it must live on; None: its own.
+        name: Of who was given it, in messages.
+
     Attributes:
         whole: The function that is solved for.
         expression: The displacement as UFL, to be differentiated by ``whole``: that itself, or what
@@ -40,20 +48,12 @@ class Displacement:
             same.
         degree: Of the elements of ``u``.
         first: Number of its first component among those of ``whole``.
+
+    Raises:
+        ValueError: It is no displacement of the mesh.
     """
 
     def __init__(self, u: Any, mesh: Any, name: str) -> None:
-        """Find it. Collective.
-
-        Args:
-            u: A vector-valued Lagrange function, or the part of a mixed one that is such, as
-                ``ufl.split`` gives it; parts that are bubbles may be added.
-            mesh: That it must live on; None: its own.
-            name: Of who was given it, in messages.
-
-        Raises:
-            ValueError: It is no displacement of the mesh.
-        """
         self.expression = u
         self.dofs: Indices | None = None
         check_kind(u, name)

@@ -23,7 +23,11 @@ class FacetPlaces:
 
     A displaced Γc is given by the positions of its nodes, those of a Lagrange element on each facet
     that has the degree of displacement and geometry; there may be other numbers of them than of
-    quadrature points.
+    quadrature points. The constructor is collective.
+
+    Args:
+        space: The displacement space.
+        x: Undeformed places of this rank's points, (n_points, gdim) (length).
 
     Attributes:
         facets: Γc as a set of facets.
@@ -37,13 +41,6 @@ class FacetPlaces:
     """
 
     def __init__(self, quadrature: SurfaceQuadrature, space: fem.FunctionSpace, x: Array) -> None:
-        """Locate the points on their facets. Collective.
-
-        Args:
-            quadrature: The points of Γc.
-            space: Of the displacement.
-            x: Undeformed places of this rank's points, (n_points, gdim) (length).
-        """
         self.facets = FacetSet(space, quadrature.surface.facets)
         self.rows = quadrature.point_rows
         n_facets, n_points = self.rows.shape

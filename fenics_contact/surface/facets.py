@@ -59,6 +59,10 @@ def facet_nodes(space: fem.FunctionSpace, facets: Index) -> Index:
 class FacetSet:
     """Facets of this rank, with reference coordinates of their own, of dimension d - 1.
 
+    Args:
+        space: Displacement space, for displaced places and its basis.
+        facets: Facets of this rank, (n_facets,).
+
     Attributes:
         cells: Cell of every facet, (n_facets,).
         nodes: Of the displacement on every facet, numbered on this rank, (n_facets, n_nodes).
@@ -68,12 +72,6 @@ class FacetSet:
     """
 
     def __init__(self, space: fem.FunctionSpace, facets: Index) -> None:
-        """Collect cells, elements and orientation of the facets.
-
-        Args:
-            space: Displacement space, for displaced places and its basis.
-            facets: Facets of this rank, (n_facets,).
-        """
         mesh = space.mesh
         self.space, self._x, self._d = space, mesh.geometry.x, mesh.topology.dim
         d = self._d

@@ -17,18 +17,17 @@ __all__ = ["PointFields"]
 class PointFields:
     """Named fields in one quadrature function, changed by `assign` and `set_rows` alone.
 
+    All are zero at first. The constructor is collective.
+
+    Args:
+        fields: Number of components by name; 0 stands for a scalar.
+
     Attributes:
         function: The function that holds all fields, for use in forms (a coefficient on the
             submesh of Γc).
     """
 
     def __init__(self, quadrature: SurfaceQuadrature, fields: Mapping[str, int]) -> None:
-        """Zero fields: no traction, no slip. Collective.
-
-        Args:
-            quadrature: The points.
-            fields: Number of components by name; 0 stands for a scalar.
-        """
         self._slices: dict[str, int | slice] = {}
         size = 0
         for name, components in fields.items():

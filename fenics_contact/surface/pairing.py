@@ -70,19 +70,19 @@ class PresentHits:
 class Pairing:
     """The surface opposite Γc, ready to be paired with the points of Γc.
 
+    The constructor is collective, and collects both surfaces.
+
     Attributes:
         rays: Both surfaces, and what rays from one meet of the other.
         round_off: Distances no larger than this are differences of coordinates and nothing else.
+
+    Raises:
+        ValueError: The opposite facets are no part of the boundary; see `ContactSurface`.
     """
 
     def __init__(
         self, obstacle: DeformableBody, quadrature: SurfaceQuadrature, space: fem.FunctionSpace
     ) -> None:
-        """Collect both surfaces. Collective.
-
-        Raises:
-            ValueError: The opposite facets are no part of the boundary; see `ContactSurface`.
-        """
         mesh = space.mesh
         self._comm, self._d = mesh.comm, mesh.topology.dim
         self._obstacle, self._quadrature = obstacle, quadrature

@@ -48,6 +48,11 @@ REASONS = {
 class Side:
     """One of two surfaces, and what is known on every rank of all its facets.
 
+    The constructor is collective.
+
+    Args:
+        body: Connected part of every node of this rank.
+
     Attributes:
         facets: Those of this rank.
         first: Number of this rank's first facet among all.
@@ -61,12 +66,6 @@ class Side:
     """
 
     def __init__(self, facets: FacetSet, body: Any) -> None:
-        """Gather. Collective.
-
-        Args:
-            facets: Of this rank.
-            body: Part of every node of this rank.
-        """
         comm = facets.space.mesh.comm
         self.facets = facets
         corners = facets.moved_corners(None)
@@ -123,6 +122,14 @@ class _Admission:
     node are opposite only where the body is notched or slit between them: at an edge or a tip they
     have the body between them.
 
+    Args:
+        obstacle: Bounds.
+        sides: That of the points, and the one that is searched.
+        facet: Of every point, its number among those of all ranks, (n,).
+        undeformed: The points without displacement, (n, d).
+        normal: The way to what is in front of them there, (n, d).
+        deep: How deep the bodies penetrate each other at each of all facets (length).
+
     Attributes:
         reason: Why what was met does not count, the most telling of all, (n,).
     """
@@ -136,16 +143,6 @@ class _Admission:
         normal: Array,
         deep: Array,
     ) -> None:
-        """Set the points.
-
-        Args:
-            obstacle: Bounds.
-            sides: That of the points, and the one that is searched.
-            facet: Of every point, its number among those of all ranks, (n,).
-            undeformed: The points without displacement, (n, d).
-            normal: The way to what is in front of them there, (n, d).
-            deep: How deep the bodies penetrate each other at each of all facets (length).
-        """
         self._obstacle, (self._from, self._to), self._facet = obstacle, sides, facet
         self._x, self._normal, self._deep = undeformed, normal, deep
         self.reason = np.full(len(normal), _NOTHING)
@@ -249,21 +246,21 @@ class Hits:
 class Rays:
     """Two surfaces that may touch, and what rays from one of them meet of the other.
 
+    The constructor is collective, and collects both surfaces.
+
     Attributes:
         here: Γc, `Side`.
         there: The opposite surface.
         body: Connected part of every node of this rank.
         facet: Facet of Γc of every owned point, among those of this rank, (n_points,).
+
+    Raises:
+        ValueError: The opposite facets are no part of the boundary; see `ContactSurface`.
     """
 
     def __init__(
         self, obstacle: DeformableBody, quadrature: SurfaceQuadrature, space: fem.FunctionSpace
     ) -> None:
-        """Collect both surfaces. Collective.
-
-        Raises:
-            ValueError: The opposite facets are no part of the boundary; see `ContactSurface`.
-        """
         mesh = space.mesh
         self._comm, self._d, self._space = mesh.comm, mesh.topology.dim, space
         self._obstacle = obstacle

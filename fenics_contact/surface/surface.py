@@ -353,7 +353,7 @@ class Sparse:
 
 
 class SurfaceQuadrature:
-    """A quadrature rule on Γc, its function spaces and its weights.
+    """A quadrature rule on Γc, its function spaces and its weights; the constructor is collective.
 
     Attributes:
         surface: The `ContactSurface`.
@@ -371,7 +371,6 @@ class SurfaceQuadrature:
     def __init__(
         self, surface: ContactSurface, degree: int, scheme: str, sparse: Sparse | None = None
     ) -> None:
-        """Make the rule. Collective."""
         if scheme == "vertex":
             degree = 1  # the rule of the vertices has no other
         self.surface, self.sparse = surface, sparse
@@ -465,24 +464,23 @@ class SurfaceQuadrature:
 class VertexAreas:
     """The area that each vertex of Γc stands for in the rule "vertex".
 
+    The constructor is collective.
+
+    Args:
+        quadrature: The rule.
+        weight: Factor w of the surface measure.
+
     Attributes:
         area: Continuous function of degree 1 on the submesh of Γc, ∫ w v ds with v the function of
             the vertex (length^(gdim-1) times the unit of the weight).
+
+    Raises:
+        ValueError: The rule is another one, or an area is not positive.
     """
 
     def __init__(
         self, quadrature: SurfaceQuadrature, weight: ufl.core.expr.Expr, name: str
     ) -> None:
-        """Measure the areas. Collective.
-
-        Args:
-            quadrature: The rule.
-            weight: Factor w of the surface measure.
-            name: Of the contact, in messages.
-
-        Raises:
-            ValueError: The rule is another one, or an area is not positive.
-        """
         surface = quadrature.surface
         if surface.quadrature_scheme != "vertex":
             raise ValueError(
@@ -520,7 +518,12 @@ class PointEvaluator:
 
     By assembly, ∫ e q ds / ∫ q ds with q the test function of the quadrature space: exact for any
     orientation of the facets, which the evaluation of expressions on facets is not in every
-    release of DOLFINx.
+    release of DOLFINx. The constructor is collective, and compiles the form.
+
+    Args:
+        expressions: Scalars and vectors by name.
+        by_points: Whether they are of functions at the points and of nothing else: then the
+            form knows Γc alone, and is the same on all bodies with facets of this kind.
 
     Attributes:
         form: What is assembled (UFL).
@@ -533,14 +536,6 @@ class PointEvaluator:
         *,
         by_points: bool = False,
     ) -> None:
-        """Compile the form. Collective.
-
-        Args:
-            quadrature: The points.
-            expressions: Scalars and vectors by name.
-            by_points: Whether they are of functions at the points and of nothing else: then the
-                form knows Γc alone, and is the same on all bodies with facets of this kind.
-        """
         components: list[ufl.core.expr.Expr] = []
         self._columns: dict[str, int | slice] = {}
         for name, expression in expressions.items():
