@@ -30,14 +30,7 @@ _TOLERANCE = 1e-5
 def kind_of_opposite(
     name: str, kinematics: str, obstacle: Obstacle, law: Law, gap: Any
 ) -> OppositeKind:
-    """What lies opposite, by obstacle and kinematics: a class that is made of `Parts`.
-
-    Args:
-        name: Of the contact, in messages.
-        kinematics: As given to `Contact`.
-        obstacle: Likewise.
-        law: Likewise.
-        gap: Likewise.
+    """What lies opposite, by what was given to `Contact`: a class that is made of `Parts`.
 
     Raises:
         ValueError: ``kinematics`` is unknown, or something was given that has no sense with it.
@@ -79,14 +72,7 @@ def is_regularised(law: Law) -> bool:
 def enforcement_of(
     name: str, enforcement: str | None, tolerance: float | None, law: Law, chosen: Accuracy | None
 ) -> tuple[bool, float]:
-    """Whether there are multipliers, and the tolerance.
-
-    Args:
-        name: Of the contact, in messages.
-        enforcement: As given to `Contact`.
-        tolerance: Likewise.
-        law: Likewise.
-        chosen: For the accuracy wanted; None: none was said.
+    """Whether there are multipliers, and the tolerance, by what was given to `Contact`.
 
     Raises:
         ValueError: The law has no use for them, or the tolerance is none.

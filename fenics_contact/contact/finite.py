@@ -127,13 +127,7 @@ class ExactView:
 def carried_history(
     x: Any, frame: Frame, history: PointFields, multipliers: PointFields | None
 ) -> dict[str, Any]:
-    """What was committed with friction, as the obstacle has carried it along (UFL).
-
-    Args:
-        x: Coordinates of the undeformed Γc.
-        frame: The frame of the obstacle.
-        history: The committed state, vectors in the frame.
-        multipliers: λ_n and λ_t, likewise; None with a penalty.
+    """What was committed with friction, as the obstacle has carried it along since (UFL).
 
     Returns:
         "foot", its place minus X (length); "traction" (stress) and "normal", of the multipliers

@@ -388,10 +388,6 @@ class Inputs:
     def check_side(self, values: PointValues, *, gap_prescribed: bool) -> None:
         """Refuse, or warn of, an obstacle that all of Γc looks away from. Collective.
 
-        Args:
-            values: Evaluated with the data as they are.
-            gap_prescribed: Whether the gap was given apart from the geometry.
-
         Raises:
             ValueError: The body is deep inside of it, too.
         """
@@ -440,11 +436,7 @@ def check_given(
 ) -> None:
     """Refuse data that are none at the points of Γc while an increment is solved.
 
-    Args:
-        name: Of the contact.
-        given: Expressions by name.
-        quadrature: The points.
-        displacement: What is solved for, on which data cannot depend: points see numbers.
+    Points see numbers, so that data cannot depend on the ``displacement`` that is solved for.
 
     Raises:
         ValueError: It names what depends on what.

@@ -141,21 +141,11 @@ class Multipliers:
         return np.asarray(self._next(values)["traction"] - self.fields.values("traction"))
 
     def leave_out(self, part: Array) -> None:
-        """Make the next change without a part, until `tangential_change` or `restore` is called.
-
-        Args:
-            part: Of what `tangential_change` gave.
-        """
+        """Leave a part out of the next change, until `tangential_change` or `restore` is called."""
         self._left_out = part
 
     def error(self, values: PointValues, history: PointFields, moved: Array) -> float:
-        """Largest change that `update` would make, see `Contact.enforcement_error`. Collective.
-
-        Args:
-            values: Of the evaluated contact.
-            history: The committed state.
-            moved: See `Contact.moved`.
-        """
+        """Largest change that `update` would make, see `Contact.enforcement_error`. Collective."""
         found = self._next(values)
         names = [n for n in ("normal_traction", "traction") if n in history]
 

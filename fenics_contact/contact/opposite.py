@@ -471,11 +471,7 @@ class Opposite(ABC):
         return 0.0
 
     def pairs_due(self, values: PointValues) -> bool:
-        """Whether `commit` will find pairs anew, for which it needs all of ``u``. Collective.
-
-        Args:
-            values: Of the state to be committed.
-        """
+        """Whether `commit` will find pairs anew, for which it needs all of ``u``. Collective."""
         return False
 
     def needs_new_pairs(self, values: PointValues, of: PointValues | None = None) -> bool:

@@ -16,9 +16,6 @@ __all__ = ["connected_bodies"]
 def connected_bodies(space: fem.FunctionSpace) -> tuple[int, npt.NDArray[np.intp]]:
     """Number of bodies, and the body of every node of this rank, its ghosts last. Collective.
 
-    Args:
-        space: Of the displacement.
-
     Returns:
         The number over all ranks, and the numbers from 0, (n_owned + n_ghosts,): the same body has
         the same number on every rank, and on any number of ranks: by their places, x first.

@@ -72,11 +72,7 @@ class Displacement:
 
     @classmethod
     def only(cls, whole: fem.Function, name: str) -> Displacement:
-        """The one part of a function that can be a displacement. Collective.
-
-        Args:
-            whole: The function, mixed or not.
-            name: Of who was given it, in messages.
+        """The one part of a function, mixed or not, that can be a displacement. Collective.
 
         Raises:
             ValueError: There is none, or more than one.
@@ -187,12 +183,7 @@ def _n_owned(function: fem.Function) -> int:
 
 
 def check_kind(u: Any, name: str, advice: str = "") -> None:
-    """Refuse what is neither function nor UFL.
-
-    Args:
-        u: What was given.
-        name: Of who was given it.
-        advice: What to do, at the end of the message.
+    """Refuse what is neither function nor UFL, with ``advice`` at the end of the message.
 
     Raises:
         ValueError: It says what it is, and where it is several functions what to do.

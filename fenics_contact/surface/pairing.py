@@ -225,11 +225,8 @@ class Pairing:
     ) -> PresentHits:
         """What the present normals of Γc meet, at points and between; once a state. Collective.
 
-        Args:
-            x: See `true_gap`.
-            u: See `true_gap`.
-            penetration: See `true_gap`.
-            facets: Of this rank on whose lattice to look, too; by default those of the last call.
+        All is as for `true_gap`, and ``facets`` are those of this rank on whose lattice to look,
+        too; by default those of the last call.
         """
         present = self._present
         known = present is not None and np.array_equal(present.u, u.x.array)

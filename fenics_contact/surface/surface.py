@@ -250,9 +250,6 @@ class ContactSurface:
 
         Points, weights, gaps and the tangent of a linear bulk are computed once.
 
-        Args:
-            name: Name of the contact, in messages.
-
         Raises:
             ValueError: Nodes have been moved; raised on all ranks.
         """
