@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -446,7 +446,7 @@ class Solver:
         """
         equations = self.equations
         equations.start = self.system.initial_forces()
-        equations.has_round_off = False
+        equations.has_round_off, equations.overload = False, None
         equations.loads = equations.motions.generalised_load(self._full.load)
 
         def iterate(first_round: bool) -> tuple[int, list[Attempt]]:
@@ -475,8 +475,12 @@ class Solver:
         chosen = self.starts.choose(first_round=first_round, cold=cold)
         start: Array = np.divide(chosen, equations.length)
         attempts: list[Attempt] = []
+        methods: Iterable[str] = self._chain(start, fallback=fallback, balance=balance)
+        if equations.overload is not None:
+            # All have failed, and only it can tell whether multipliers bear what springs did not.
+            methods = ("alternating",)
         equations.overload = None
-        for method in self._chain(start, fallback=fallback, balance=balance):
+        for method in methods:
             equations.solution.array[:] = start
             equations.watch.start()
             if stiffness_changed:
@@ -484,6 +488,7 @@ class Solver:
             iterations, reason = self.methods.get(method, self.main).solve()
             attempts.append(Attempt(method, iterations, self._outcome(reason)))
             if reason > 0:
+                equations.overload = None
                 break
             if self._comm.rank == 0:
                 logger.info("%s", attempts[-1])
