@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.optimize
 from mpi4py import MPI
 
 from fenics_contact.contact.contact import Contact
@@ -20,8 +21,6 @@ __all__ = ["count_slip_from_touch"]
 
 # First touch is found where the least gap is below this share of the one at the start.
 _TOUCHING_GAP_RATIO = 1e-6
-# Evaluations by which it is found where gaps are not linear in the displacement.
-_MAX_EVALUATIONS = 20
 
 
 def count_slip_from_touch(
@@ -157,22 +156,20 @@ class _Path:
     def first_touch(self) -> float:
         """Share of the increment at which the least gap closes, 1 where none does. Collective."""
         comm = self.full.unknowns.comm
-        low, high = 0.0, 1.0
-        at_low, at_high = self.gap(low), self.gap(high)
-        touching = _TOUCHING_GAP_RATIO * global_min(comm, at_low, empty=np.inf)
-        if not global_min(comm, at_high, empty=np.inf) < 0.0:
+        at_start, at_end = self.gap(0.0), self.gap(1.0)
+        touching = _TOUCHING_GAP_RATIO * global_min(comm, at_start, empty=np.inf)
+        if not global_min(comm, at_end, empty=np.inf) < 0.0:
             return 1.0
-        share = 1.0
-        for _ in range(_MAX_EVALUATIONS):
-            closing = (at_high < 0.0) & (at_low < np.inf)
-            ratios = at_low[closing] / (at_low[closing] - at_high[closing])
-            share = low + (high - low) * global_min(comm, ratios, empty=0.5)
-            now = self.gap(share)
-            least = global_min(comm, now, empty=np.inf)
-            if abs(least) <= touching:
-                break
-            if least < 0.0:
-                high, at_high = share, now
-            else:
-                low, at_low = share, now
-        return share
+
+        def least_gap(share: float) -> float:
+            least = global_min(comm, self.gap(share), empty=np.inf)
+            return 0.0 if abs(least) <= touching else least
+
+        closing = (at_end < 0.0) & (at_start < np.inf)
+        ratios = at_start[closing] / (at_start[closing] - at_end[closing])
+        share = global_min(comm, ratios, empty=0.5)  # exact where gaps are linear
+        least = least_gap(share)
+        if least == 0.0:
+            return share
+        bracket = (0.0, share) if least < 0.0 else (share, 1.0)
+        return float(scipy.optimize.brentq(least_gap, *bracket))
