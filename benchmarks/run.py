@@ -12,7 +12,8 @@ the figures and the table of targets, from the results of this run and earlier o
 compiled into a new cache, so that first runs include the compilation. The exit code is 1 if a
 benchmark failed. ``methods.py``, ``nonlinear.py`` (five minutes each) and ``trade.py`` (ten
 minutes) have their tables on other pages of docs/ and are run by name only, as are
-``bolted_joint.py``, which takes longer than ten minutes, and ``random_scenes.py`` (hours).
+``bolted_joint.py``, which takes longer than ten minutes, ``random_scenes.py`` and ``selection.py``
+(hours).
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
 HELPERS = ("__init__", "run", "page", "timing", "costs", "targets", "trade_page", "trade_scenes")
 # Long, or with a page of their own in docs/.
-BY_NAME_ONLY = ("bolted_joint", "methods", "nonlinear", "random_scenes", "trade")
+BY_NAME_ONLY = ("bolted_joint", "methods", "nonlinear", "random_scenes", "selection", "trade")
 
 
 def machine() -> str:
