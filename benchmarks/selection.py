@@ -38,7 +38,8 @@ import fenics_contact as fc
 from benchmarks import timing
 from fenics_contact.elasticity import LinearElastic, NeoHookean
 from scenes.elasticity import displacement_space, hold
-from scenes.processes import command, environment
+from scenes.problems import count
+from scenes.processes import answer
 from scenes.tags import sides
 from verification import report
 
@@ -237,8 +238,7 @@ def child(scene: Scene, way: str) -> None:
     try:
         solve(scene, make(replace(scene, generous=True), 300.0), WAYS[way])  # compiles the forms
         made = make(scene, float(scene.dofs))
-        space = made.u.function_space
-        row["dofs"] = space.dofmap.index_map.size_global * space.dofmap.bs
+        row["dofs"] = count(made.u.function_space)
         COMM.Barrier()
         start, before = time.perf_counter(), _memory("VmRSS")
         row["force"], row["iterations"] = solve(scene, made, WAYS[way])
@@ -260,17 +260,13 @@ def _memory(name: str) -> float:
 
 def run(scene: Scene, seed: int, way: str, limit: float) -> timing.Row:
     """Run a way in a process of its own; ended after a time (s)."""
-    words = command(scene.ranks, "-m", "benchmarks.selection", "--child", json.dumps([seed, way]))
-    words += [json.dumps(asdict(scene))]
+    words = ["-m", "benchmarks.selection", "--child", way, json.dumps(asdict(scene))]
     try:
-        done = subprocess.run(
-            words, env=environment(), capture_output=True, text=True, timeout=limit
-        )
-        row = json.loads(done.stdout.strip().splitlines()[-1])
+        row = answer(scene.ranks, *words, seconds=limit)
     except subprocess.TimeoutExpired:
         row = {"outcome": "slow", "seconds": limit}
-    except (IndexError, json.JSONDecodeError):
-        row = {"outcome": "ended", "why": done.stderr[-200:]}
+    except subprocess.CalledProcessError:
+        row = {"outcome": "failed"}
     return {"seed": seed, "way": way} | row
 
 
@@ -285,7 +281,8 @@ def regret(rows: list[timing.Row]) -> list[timing.Row]:
         solved = {way: row for way, row in mine.items() if row["outcome"] == "solved"}
         default = solved.get(DEFAULT)
         if default is None or len(solved) < 2:
-            table.append({"seed": seed, "best": "–" if not solved else min(solved)})
+            outcome = mine[DEFAULT]["outcome"]
+            table.append({"seed": seed, "default": outcome, "solved by": ", ".join(solved)})
             continue
         others = {way: row for way, row in solved.items() if way != DEFAULT}
         best = min(others, key=lambda way: float(others[way]["seconds"]))
@@ -315,8 +312,8 @@ def main() -> None:
     parser.add_argument("--child", nargs=2, help="for the processes inside")
     arguments = parser.parse_args()
     if arguments.child:
-        (_, way), drawn = json.loads(arguments.child[0]), json.loads(arguments.child[1])
-        return child(Scene(**drawn), way)
+        way, drawn = arguments.child
+        return child(Scene(**json.loads(drawn)), way)
     scenes, most = (4, 3e3) if arguments.short else (arguments.scenes, arguments.most)
     rows: list[timing.Row] = []
     for seed in range(arguments.start, arguments.start + scenes):

@@ -31,14 +31,20 @@ def command(ranks: int, *words: object) -> list[str]:
     return [*launch, sys.executable, *map(str, words)]
 
 
-def answer(ranks: int, *words: object) -> Any:
+def answer(ranks: int, *words: object, seconds: float | None = None) -> Any:
     """The last line that Python prints with these words, on several ranks by mpirun, as JSON.
 
     Raises:
         subprocess.CalledProcessError: It failed.
+        subprocess.TimeoutExpired: It took more than ``seconds``, and was ended.
     """
     done = subprocess.run(
-        command(ranks, *words), env=environment(), stdout=subprocess.PIPE, text=True, check=True
+        command(ranks, *words),
+        env=environment(),
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        timeout=seconds,
     )
     return json.loads(done.stdout.strip().splitlines()[-1])
 

@@ -186,10 +186,7 @@ class FollowedOpposite(BodyOpposite):
         told = self._told_of_pairs(arrays) | {"normal": normal, "jump": pairs.jump_since()}
         if not self._parts.law.has_friction:
             return told
-        framed = {"framed_normal": normal, "framed_traction": arrays["traction"]}
-        if "elastic_slip" in arrays:
-            framed["elastic_slip"] = arrays["elastic_slip"]
-        told |= {name: pairs.turned(vectors, back=True) for name, vectors in framed.items()}
+        told |= self._framed(arrays, normal)
         old = pairs.turned(self._parts.history.values("traction"))
         old -= np.sum(old * normal, axis=1)[:, None] * normal
         return told | {"foot": np.zeros_like(normal), "carried_traction": old}
@@ -204,9 +201,9 @@ class FollowedOpposite(BodyOpposite):
         """See `Opposite`."""
         return self._present.undeformed_gap
 
-    def turned(self, vectors: Array) -> Array:
+    def turned(self, vectors: Array, *, back: bool = False) -> Array:
         """See `Opposite`: of the committed bodies."""
-        return self._present.turned(vectors)
+        return self._present.turned(vectors, back=back)
 
     @property
     def pairs_anew(self) -> bool:

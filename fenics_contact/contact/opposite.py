@@ -353,9 +353,16 @@ class Opposite(ABC):
         """Whether the obstacle turns."""
         return self._parts.inputs.rotation is not None
 
-    def turned(self, vectors: Array) -> Array:
-        """Directions in the frame of the history, as they are in space: (n_points, gdim)."""
+    def turned(self, vectors: Array, *, back: bool = False) -> Array:
+        """Directions in the frame of the history as they are in space, or back: (n_points, d)."""
         return vectors
+
+    def _framed(self, arrays: Mapping[str, Array], normal: Array) -> dict[str, Array]:
+        """Normal, traction and elastic slip in the frame of the history, (n_points, gdim) each."""
+        framed = {"framed_normal": normal, "framed_traction": arrays["traction"]}
+        if "elastic_slip" in arrays:
+            framed["elastic_slip"] = arrays["elastic_slip"]
+        return {name: self.turned(vectors, back=True) for name, vectors in framed.items()}
 
     def committed_offset(self, values: PointValues) -> Array:
         """Return the offset from the points to their committed places relative to the obstacle.

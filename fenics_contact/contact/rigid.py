@@ -144,10 +144,7 @@ class MovingOpposite(Opposite):
         told = {"normal": normal, "jump": jump}
         if not self._parts.law.has_friction:
             return told
-        framed = {"framed_normal": normal, "framed_traction": arrays["traction"]}
-        if "elastic_slip" in arrays:
-            framed["elastic_slip"] = arrays["elastic_slip"]
-        told |= {name: view.turned(vectors, back=True) for name, vectors in framed.items()}
+        told |= self._framed(arrays, normal)
         way = view.turned(view.values("gap")[:, None] * normal, back=True)
         return told | {"foot": jump + way, "carried_traction": view.values("committed traction")}
 
@@ -164,9 +161,9 @@ class MovingOpposite(Opposite):
         self.update()
         return self._view.values("gap"), self._view.values("normal")
 
-    def turned(self, vectors: Array) -> Array:
+    def turned(self, vectors: Array, *, back: bool = False) -> Array:
         """See `Opposite`: of the frame of the obstacle."""
-        return self._view.turned(vectors)
+        return self._view.turned(vectors, back=back)
 
     def gradient_error(self, values: PointValues) -> Array:
         """See `Opposite`."""
