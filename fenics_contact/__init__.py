@@ -6,7 +6,7 @@ from fenics_contact._version import __version__
 from fenics_contact.checks.verdict import ForceBalance, Verdict
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.contact import Contact
-from fenics_contact.contact.general import find_contact_pairs
+from fenics_contact.contact.general_contact import find_contact_pairs
 from fenics_contact.contact.values import Resultants, Status, ZoneExtent
 from fenics_contact.estimates.adaptation import AdaptationLevel, adapt
 from fenics_contact.estimates.errors import ErrorBudget, estimate_errors

@@ -16,7 +16,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 __all__ = [
-    "Waiting",
+    "CompileTimer",
     "compile_by_rule",
     "compile_expression",
     "compile_form",
@@ -83,7 +83,7 @@ def printed_as_ever() -> AbstractContextManager[Any]:
     )
 
 
-class Waiting:
+class CompileTimer:
     """Time that went into compilation in this process."""
 
     def __init__(self) -> None:
@@ -106,4 +106,4 @@ class Waiting:
             print(f"\r\x1b[K{text}", file=sys.stderr)  # in place of a bar's line
 
 
-waiting = Waiting()
+waiting = CompileTimer()

@@ -10,14 +10,14 @@ from enum import Enum
 import numpy as np
 
 from fenics_contact.checks.energy import Energy, EnergyState
-from fenics_contact.checks.given import check_values
-from fenics_contact.checks.judge import Judge
+from fenics_contact.checks.input_validation import check_values
 from fenics_contact.checks.verdict import Verdict
+from fenics_contact.checks.verifier import Verifier
 from fenics_contact.contact.contact import Contact
 from fenics_contact.failure import NotConverged
-from fenics_contact.methods.approach import Approach
 from fenics_contact.methods.attempt import Attempt
-from fenics_contact.methods.first_touch import count_slip_from_touch
+from fenics_contact.methods.first_touch import set_slip_reference_at_touch
+from fenics_contact.methods.initial_positioning import InitialPositioning
 from fenics_contact.methods.load_balance import check_balance, find_free_modes
 from fenics_contact.methods.opposite_points import OppositePoints
 from fenics_contact.methods.solver import Solver
@@ -25,16 +25,16 @@ from fenics_contact.methods.unloaded_bodies import move_unloaded_bodies
 from fenics_contact.parallel import global_max
 from fenics_contact.state import State, Trial
 from fenics_contact.step import Step
-from fenics_contact.systems.followed import FollowedModulus
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
+from fenics_contact.systems.modulus_tracking import TrackedModulus
 from fenics_contact.systems.system import System
 from fenics_contact.types import Array
 
-__all__ = ["Again", "Increment", "IncrementSolver"]
+__all__ = ["Increment", "IncrementSolver", "Retry"]
 
 
-class Again(Enum):
+class Retry(Enum):
     """Why an increment is solved again; the outcome of the last attempt, if there was one."""
 
     UNKNOWNS = "contact spreads beyond the retained dofs"
@@ -58,7 +58,7 @@ class Increment:
     started: float = field(default_factory=time.perf_counter)
     tried: list[Attempt] = field(default_factory=list)
 
-    def ends(self, outcome: Again) -> Again:
+    def ends(self, outcome: Retry) -> Retry:
         """Let this be the outcome of the last attempt, and return it."""
         self.tried[-1] = replace(self.tried[-1], outcome=outcome.value)
         return outcome
@@ -78,8 +78,8 @@ class IncrementSolver:
 
     full: FullSystem
     solver: Solver
-    judge: Judge
-    modulus: FollowedModulus
+    verifier: Verifier
+    modulus: TrackedModulus
     prefix: str
 
     # ---- what is given ---------------------------------------------------------------------------
@@ -112,7 +112,7 @@ class IncrementSolver:
 
     def attempt(
         self, increment: Increment, state: State, present: State | Trial
-    ) -> tuple[Trial, Step] | Again:
+    ) -> tuple[Trial, Step] | Retry:
         """Solve an increment between its present pairs, on the unknowns retained. Collective.
 
         Args:
@@ -134,23 +134,23 @@ class IncrementSolver:
             self._predict_opposite_points(points, state, load)
         before = self.full.state()
         self.full.prescribe()
-        solver.starts.moved_from(before)
+        solver.predictor.moved_from(before)
         stiffness_changed = self.full.update_stiffness()
         if stiffness_changed and self.full.bulk.linear:
             self.modulus.measure()
-        approach = Approach(self.full, solver.equations.motions, load, before)
+        approach = InitialPositioning(self.full, solver.equations.motions, load, before)
         cold = approach.lead(first=state.increment == 0)
-        if solver.chooses():
-            return Again.UNKNOWNS
+        if solver.select_dofs():
+            return Retry.UNKNOWNS
         solver.update_system(stiffness_changed)
         self.full.scales.begin(self.full.operators)
         solver.system.begin(load)
-        solver.equations.began = state.unknowns
+        solver.equations.initial_unknowns = state.unknowns
         led = np.where(self.full.constrained, before, self.full.state())
-        end = count_slip_from_touch(self.full, led, solver.end_without)
-        solver.starts.change = state.change
-        solver.starts.expected = end if points.end is None else points.end
-        with solver.system.acting():
+        end = set_slip_reference_at_touch(self.full, led, solver.end_without)
+        solver.predictor.change = state.change
+        solver.predictor.expected = end if points.end is None else points.end
+        with solver.system.restricted_contacts():
             reason, attempts, rounds = solver.solve(
                 cold=cold,
                 stiffness_changed=stiffness_changed,
@@ -165,21 +165,25 @@ class IncrementSolver:
             solver.system.complete(solver.system.pending_field)
         self.full.evaluate()
         part = solver.system.part if lags else np.asarray
-        if reason > 0 and move_unloaded_bodies(solver.equations, part) and solver.starts.factored:
-            solver.starts.note_borne()
+        if (
+            reason > 0
+            and move_unloaded_bodies(solver.equations, part)
+            and solver.predictor.factored
+        ):
+            solver.predictor.store_converged_contacts()
         increment.tried += attempts
         if reason <= 0 and points.drop_prediction():
-            return increment.ends(Again.FROM_COMMITTED)
-        if solver.misses(found=reason > 0):
-            return increment.ends(Again.UNKNOWNS)
+            return increment.ends(Retry.FROM_COMMITTED)
+        if solver.needs_more_dofs(found=reason > 0):
+            return increment.ends(Retry.UNKNOWNS)
         if reason > 0 and (slid := points.to_update()):
             return self._choose_pairs(increment, slid, interior)
         kinematics = reason > 0  # a solver that failed may have no factors for it
         if lags:
-            verdict, energies = self._judge_kept(state.unknowns, kinematics=kinematics)
+            verdict, energies = self._verify_retained(state.unknowns, kinematics=kinematics)
         else:
             assemble = increment.recover_interior or not solver.system.confined
-            verdict, energies = self._judge_all(
+            verdict, energies = self._verify_all(
                 state.unknowns, kinematics=kinematics, assemble=assemble
             )
         if reason > 0 and (slid := points.to_update_for(verdict.pairing_errors)):
@@ -190,11 +194,11 @@ class IncrementSolver:
             verdict = replace(verdict, friction_energy_gain=energy.friction_energy_gain)
         if energy is None or verdict.failures:
             if points.drop_prediction():
-                return increment.ends(Again.FROM_COMMITTED)
+                return increment.ends(Retry.FROM_COMMITTED)
             raise self._not_converged(state, reason, verdict, increment.tried)
-        self.judge.warn_of_large_motion(verdict)
-        self.judge.warn_of_round_off(verdict)
-        self.judge.warn_of_few_points()
+        self.verifier.warn_of_large_motion(verdict)
+        self.verifier.warn_of_round_off(verdict)
+        self.verifier.warn_of_few_points()
         trials = (
             c.states.trial(is_loaded=verdict.equations[c.name].is_loaded)
             for c in self.full.contacts
@@ -233,7 +237,7 @@ class IncrementSolver:
 
     def _choose_pairs(
         self, increment: Increment, contacts: Sequence[Contact], interior: Array | None
-    ) -> Again:
+    ) -> Retry:
         """Choose where to find the pairs of contacts next, by where it has ended. Collective.
 
         Args:
@@ -244,7 +248,7 @@ class IncrementSolver:
         if interior is not None:
             self.solver.system.complete(interior)
         increment.points.choose_states(contacts, self.full.state())
-        return increment.ends(Again.PAIRS)
+        return increment.ends(Retry.PAIRS)
 
     def _may_lag(self, state: State) -> bool:
         """Whether u can stay behind: energies and pairs must be found without it. Collective."""
@@ -253,16 +257,19 @@ class IncrementSolver:
             return False
         for contact in contacts:
             # A body that has come to no pairs yet is looked for where it is.
-            alone = contact.opposite.may_pair_anew and not comm.allreduce(int(contact.paired.any()))
-            if alone or contact.opposite.pairs_anew:
+            alone = contact.contact_kinematics.can_update_pairs and not comm.allreduce(
+                int(contact.paired.any())
+            )
+            if alone or contact.contact_kinematics.updates_pairs:
                 return False
         # Of nodes that the quadrature points do not carry only a complete u tells where they are.
         carried = (
-            c.opposite.sampler is None or c.facet_places.points_carry_nodes for c in contacts
+            c.contact_kinematics.sampler is None or c.facet_places.points_carry_nodes
+            for c in contacts
         )
         if not all(carried):
             return False
-        if self.solver.system.mark in state.energy.forces:
+        if self.solver.system.coordinate_id in state.energy.forces:
             return True
         return state.increment == 0 and not comm.allreduce(int(state.unknowns.any()))
 
@@ -284,38 +291,38 @@ class IncrementSolver:
 
     def _energy(self, state: State, energies: EnergyState, points: OppositePoints) -> Energy:
         """The energies of the increment that has ended in a state. Collective."""
-        began, mark = state.energy, self.solver.system.mark
-        if self.full.mark not in energies.forces and mark not in began.forces:
+        began, coordinate_id = state.energy, self.solver.system.coordinate_id
+        if self.full.coordinate_id not in energies.forces and coordinate_id not in began.forces:
             # From rest, of the retained dofs alone.
             nothing = Forces.none(np.zeros(1), np.zeros(1, dtype=np.intp))
-            began = began.with_forces(mark, nothing)
+            began = began.with_forces(coordinate_id, nothing)
         if points.replaced:
             began = began.between(self.full.contacts)
         return energies.since(began, self.full.contacts, self.full.scales)
 
-    def _judge_all(
+    def _verify_all(
         self, began: Array, *, kinematics: bool, assemble: bool
     ) -> tuple[Verdict, EnergyState]:
-        """Judge a complete u by assembly, past SNES and its residual, or by K u. Collective."""
+        """Verifier a complete u by assembly, past SNES and its residual, or by K u. Collective."""
         if assemble:
             bulk = self.full.with_obstacles(self.full.bulk.assemble_residual())
         else:
             bulk = self.full.product_force()
-        verdict, found = self.judge_system(self.full, bulk, began=began, kinematics=kinematics)
-        forces: dict[object, Forces] = {self.full.mark: found}
+        verdict, found = self.verify_system(self.full, bulk, began=began, kinematics=kinematics)
+        forces: dict[object, Forces] = {self.full.coordinate_id: found}
         if self.solver.condensed and self.full.bulk.symmetric:
-            forces[self.solver.system.mark] = self.solver.system.present_forces()
+            forces[self.solver.system.coordinate_id] = self.solver.system.present_forces()
         return verdict, EnergyState.at(forces, self.full.contacts)
 
-    def _judge_kept(self, began: Array, *, kinematics: bool) -> tuple[Verdict, EnergyState]:
-        """Judge the condensed equations; u stays behind. Collective."""
+    def _verify_retained(self, began: Array, *, kinematics: bool) -> tuple[Verdict, EnergyState]:
+        """Verifier the condensed equations; u stays behind. Collective."""
         system = self.solver.system
-        verdict, found = self.judge_system(
+        verdict, found = self.verify_system(
             system, system.bulk_force(), began=began, kinematics=kinematics
         )
-        return verdict, EnergyState.at({system.mark: found}, self.full.contacts)
+        return verdict, EnergyState.at({system.coordinate_id: found}, self.full.contacts)
 
-    def judge_system(
+    def verify_system(
         self,
         system: System,
         bulk: Array,
@@ -323,16 +330,16 @@ class IncrementSolver:
         began: Array | None = None,
         kinematics: bool = False,
     ) -> tuple[Verdict, Forces]:
-        """`Judge.judge` for the increment that was solved last. Collective.
+        """`Verifier.verifier` for the increment that was solved last. Collective.
 
         Args:
             system: The unknowns on which the residual is looked at.
             bulk: Residual of the bulk on these (force).
-            began: The state in which it began; None: see `Judge.judge`.
+            began: The state in which it began; None: see `Verifier.verifier`.
             kinematics: Whether to look at what small displacements leave out.
         """
         equations = self.solver.equations
-        return self.judge.judge(
+        return self.verifier.verify(
             system,
             bulk,
             start=equations.start,

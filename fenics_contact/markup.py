@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
-__all__ = ["shown"]
+__all__ = ["html_table"]
 
 
-def shown(
+def html_table(
     title: str,
     header: Sequence[str],
     rows: Iterable[Sequence[str]],

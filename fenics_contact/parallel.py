@@ -16,10 +16,9 @@ from mpi4py import MPI
 from fenics_contact.types import Array
 
 __all__ = [
-    "agreed",
     "all_finite",
+    "broadcast_from_root",
     "collective_errors",
-    "fail_together",
     "gather_on_first",
     "gather_rows",
     "global_max",
@@ -27,6 +26,7 @@ __all__ = [
     "global_min",
     "global_sum",
     "longest",
+    "raise_collectively",
     "warn",
 ]
 
@@ -38,7 +38,7 @@ PATIENCE = 30.0
 _TAG = 7351
 
 
-def fail_together(comm: MPI.Comm, error: BaseException) -> None:
+def raise_collectively(comm: MPI.Comm, error: BaseException) -> None:
     """Come back where all ranks have failed; end all of them where this one is alone.
 
     A rank that fails where others do not is waited for by them in some collective call, for ever:
@@ -105,7 +105,7 @@ def warn(comm: MPI.Comm, text: str, *, category: type[Warning] = UserWarning) ->
     warnings.warn(text, category, stacklevel=3)
 
 
-def agreed(comm: MPI.Comm, value: Any) -> Any:
+def broadcast_from_root(comm: MPI.Comm, value: Any) -> Any:
     """The first rank's value, on all ranks. Collective.
 
     For what every rank computes of the same numbers and then decides by: factorisations of equal

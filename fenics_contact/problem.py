@@ -14,29 +14,29 @@ from petsc4py import PETSc
 
 from fenics_contact.arguments import check_bool, is_number, listed
 from fenics_contact.checks.energy import EnergyState
-from fenics_contact.checks.given import (
+from fenics_contact.checks.input_validation import (
     check_contacts,
     check_start,
     constrained_unknowns,
     find_displacement,
 )
-from fenics_contact.checks.judge import Judge
 from fenics_contact.checks.verdict import Verdict
+from fenics_contact.checks.verifier import Verifier
 from fenics_contact.contact.contact import Contact
 from fenics_contact.failure import NotConverged
-from fenics_contact.increment import Again, Increment, IncrementSolver
+from fenics_contact.increment import Increment, IncrementSolver, Retry
 from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
 from fenics_contact.methods.load_balance import find_free_modes
 from fenics_contact.methods.opposite_points import OppositePoints
 from fenics_contact.methods.solver import Settings, Solver
-from fenics_contact.parallel import fail_together, global_max, warn
+from fenics_contact.parallel import global_max, raise_collectively, warn
 from fenics_contact.state import State, Trial
 from fenics_contact.step import Step
 from fenics_contact.systems import linear
 from fenics_contact.systems.bulk import Bulk
-from fenics_contact.systems.followed import FollowedModulus
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
+from fenics_contact.systems.modulus_tracking import TrackedModulus
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array
@@ -177,12 +177,12 @@ class ContactProblem:
         bulk.check_finite()
         self.full.update_stiffness()
         bulk.check_elastic()
-        modulus = FollowedModulus(bulk, self.displacement, self.contacts)
+        modulus = TrackedModulus(bulk, self.displacement, self.contacts)
         self.motions = RigidBodyModes(self.full)
         self.initial_penetration = check_start(self.contacts)
         find_free_modes(self.motions, self.full)
         self.full.scales.begin(self.full.operators)
-        judge = Judge(self.full, self.motions, tolerance=tolerance, cross_check=cross_check)
+        judge = Verifier(self.full, self.motions, tolerance=tolerance, cross_check=cross_check)
         self.solver = Solver(self.full, self.motions, settings)
         self._increments = IncrementSolver(self.full, self.solver, judge, modulus, prefix)
         self.full.evaluate()
@@ -193,16 +193,16 @@ class ContactProblem:
 
     def _initial_state(self) -> State:
         """Return a body at rest, or the state that another problem has left. Collective."""
-        unknowns, mark = self.full.state(), self.full.mark
+        unknowns, coordinate_id = self.full.state(), self.full.coordinate_id
         none = np.zeros_like(unknowns)
         contacts = tuple(contact.states.committed for contact in self.contacts)
         if any(state.commits for state in contacts):
             load = self.full.present_load()
             self.full.begin(load)
             bulk = self.full.with_obstacles(self.full.bulk.assemble_residual())
-            forces: dict[object, Forces] = {mark: self.full.present_forces(bulk)}
+            forces: dict[object, Forces] = {coordinate_id: self.full.present_forces(bulk)}
             return State(unknowns, contacts, load, EnergyState.at(forces, self.contacts), none)
-        forces = {mark: Forces.none(unknowns, self.full.label)}
+        forces = {coordinate_id: Forces.none(unknowns, self.full.label)}
         energy = EnergyState.unloaded(forces, self.contacts)
         return State(unknowns, contacts, none, energy, none)
 
@@ -231,11 +231,11 @@ class ContactProblem:
 
         It limits the errors of contact force and pressure, between two bodies that of the force.
         """
-        return self._increments.judge.small_displacement_tolerance
+        return self._increments.verifier.small_displacement_tolerance
 
     @small_displacement_tolerance.setter
     def small_displacement_tolerance(self, tolerance: float) -> None:
-        self._increments.judge.small_displacement_tolerance = tolerance
+        self._increments.verifier.small_displacement_tolerance = tolerance
 
     @property
     def expected_increments(self) -> int:
@@ -357,20 +357,20 @@ class ContactProblem:
                 while True:
                     with self.solver.options.present():
                         found = self._increments.attempt(increment, self.state, self._present)
-                    if not isinstance(found, Again):
+                    if not isinstance(found, Retry):
                         break
-                    if found is Again.PAIRS:
+                    if found is Retry.PAIRS:
                         self._find_pairs(points)
                     back()
                     self._take_committed_pairs()
                     points.begin(self.contacts)
                     # Outside, lest a SNES that is made anew takes its options for the caller's.
-                    if found is Again.UNKNOWNS:
+                    if found is Retry.UNKNOWNS:
                         spread = sum(each.outcome == found.value for each in increment.tried)
                         self.solver.change(anew=spread <= 1)
                 release_interrupt()
         except BaseException as error:
-            fail_together(self._comm, error)
+            raise_collectively(self._comm, error)
             back()
             if not isinstance(error, NotConverged | ValueError):
                 self.solver.recover()
@@ -393,8 +393,11 @@ class ContactProblem:
     def _take_committed_pairs(self) -> None:
         """Go back to the committed state of contacts that have other pairs now. Collective."""
         for contact in self.contacts:
-            pairs = contact.states.committed.opposite.pairs
-            if not contact.opposite.follows and contact.pairs.jump_map is not pairs.jump_map:
+            pairs = contact.states.committed.kinematics.pairs
+            if (
+                not contact.contact_kinematics.follows
+                and contact.pairs.jump_map is not pairs.jump_map
+            ):
                 contact.states.restore()
 
     def _is_present(self, unknowns: Array) -> bool:
@@ -454,13 +457,13 @@ class ContactProblem:
         before = self.full.state()
         self.solver.system.complete(present.interior)
         self.full.begin(present.load)
-        verdict, forces = self._increments.judge_system(self.full, self.full.product_force())
+        verdict, forces = self._increments.verify_system(self.full, self.full.product_force())
         if verdict.failures:
             self.full.set_state(before)
             number = self.increment + (not is_committed)
             reason = int(self.snes.getConvergedReason())
             raise NotConverged(number, reason, verdict, prefix=self._prefix)
-        energy = present.energy.with_forces(self.full.mark, forces)
+        energy = present.energy.with_forces(self.full.coordinate_id, forces)
         completed = replace(present, unknowns=self.full.state(), interior=None, energy=energy)
         if isinstance(completed, State):
             self.state = completed
@@ -492,7 +495,9 @@ class ContactProblem:
         if self._trial is None:
             return
         trials = zip(self.contacts, self._trial.contacts, strict=True)
-        due = [contact.opposite.pairs_due(trial.points) for contact, trial in trials]
+        due = [
+            contact.contact_kinematics.needs_pair_update(trial.points) for contact, trial in trials
+        ]
         if any(due):  # which takes all of u, whatever of it was wanted
             self.complete()
         trial, start = self._trial, self.state
@@ -501,7 +506,7 @@ class ContactProblem:
             for contact, found in zip(self.contacts, trial.contacts, strict=True):
                 contact.states.commit(found)
         except BaseException as error:
-            fail_together(self._comm, error)
+            raise_collectively(self._comm, error)
             for contact, state in zip(self.contacts, start.contacts, strict=True):
                 contact.states.set_state(state)
             self.restore()
@@ -553,11 +558,11 @@ class ContactProblem:
                 "were changed; call commit() or restore() before saving the state"
             )
         self.complete()
-        state, forces = self.state, self.state.energy.forces[self.full.mark]
+        state, forces = self.state, self.state.energy.forces[self.full.coordinate_id]
         change = np.zeros_like(state.load) if state.change is None else state.change
         retained = np.zeros_like(state.load)
         if self.solver.condensed:
-            retained[self.solver.system.unknowns.kept] = 1.0
+            retained[self.solver.system.unknowns.retained] = 1.0
         loads = [forces.internal, forces.external, state.load_change]
         return np.stack([state.unknowns, change, *loads, retained, self.full.constrained])
 
@@ -605,7 +610,7 @@ class ContactProblem:
         for contact, (history, values), again in zip(self.contacts, points, anew, strict=True):
             contact.states.load_restart(history, values, anew=bool(again))
         found = Forces(state, internal, external, self.full.label)
-        forces: dict[object, Forces] = {self.full.mark: found}
+        forces: dict[object, Forces] = {self.full.coordinate_id: found}
         energy = EnergyState.at(forces, self.contacts)
         self.state = State(
             unknowns=state.copy(),
@@ -621,6 +626,6 @@ class ContactProblem:
     def restart_solver(self) -> None:
         """Discard what the solver stores from earlier increments. Collective."""
         self.solver.restart()
-        energy, mark = self.state.energy, self.full.mark
-        forces = {mark: energy.forces[mark]}
+        energy, coordinate_id = self.state.energy, self.full.coordinate_id
+        forces = {coordinate_id: energy.forces[coordinate_id]}
         self.state = replace(self.state, energy=replace(energy, forces=forces))

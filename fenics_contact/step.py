@@ -9,7 +9,7 @@ import numpy as np
 from fenics_contact.checks.energy import Energy
 from fenics_contact.checks.verdict import Verdict
 from fenics_contact.contact.values import Resultants
-from fenics_contact.markup import shown
+from fenics_contact.markup import html_table
 from fenics_contact.methods.attempt import Attempt
 from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
@@ -132,7 +132,7 @@ class Step:
         ]
         remarks = [f"{self._made()}; {self._residual()}", *self._left_out()]
         remarks += ["Forces and areas are per unit thickness."] * self._per_thickness
-        return shown(title, (*header, "stick", "slip", "open"), rows, remarks)
+        return html_table(title, (*header, "stick", "slip", "open"), rows, remarks)
 
 
 def _components(vector: Array) -> str:

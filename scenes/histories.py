@@ -150,10 +150,10 @@ def picture(made: History) -> dict[str, Array]:
     energy = problem.state.energy
     found["springs"] = np.array([COMM.allreduce(sum(map(np.sum, energy.springs)))])
     if problem.solver.condensed:
-        found["kept"] = problem.solver.system.unknowns.kept
+        found["kept"] = problem.solver.system.unknowns.retained
     for c, ways in zip(problem.contacts, energy.contacts, strict=True):
         found[f"{c.name} history"] = at_points(c, c.history.rows())
-        found[f"{c.name} jump"] = at_points(c, c.opposite.committed_jump)
+        found[f"{c.name} jump"] = at_points(c, c.contact_kinematics.committed_jump)
         found[f"{c.name} ways"] = at_points(c, np.hstack(ways))
         if c.multipliers is not None:
             found[f"{c.name} multipliers"] = at_points(c, c.multipliers.fields.rows())

@@ -153,7 +153,7 @@ def limited(made: Rub, largest: float) -> list[float]:
         if now[0] - at[0] > largest:
             made.problem.solver.main.max_it, kept = 0, made.problem.solver.main.max_it
             made.problem.snes.setTolerances(max_it=0)
-            made.problem.solver.starts.predict = False  # that guess can be the solution
+            made.problem.solver.predictor.predict = False  # that guess can be the solution
             try:
                 return solve(**kwargs)
             finally:

@@ -1,4 +1,4 @@
-"""Alternation of minimum problems: the direct solution's, and what the direct methods cannot do."""
+"""Tresca fixed point: the solution of the direct methods, and what these cannot do."""
 
 from itertools import pairwise
 
@@ -106,7 +106,7 @@ def test_the_residual_is_the_gradient_of_the_energy(cell, condensation):
     scene, problem, contact = pressed(cell, law, "newton", side=0.03, condensation=condensation)
     problem.solve()
     problem.commit()
-    contact.acting.fix_friction_bound(contact.values.friction_bound)
+    contact.effective_law.fix_friction_bound(contact.values.friction_bound)
     space = problem.solver.system
     equations = problem.solver.equations
     x = equations.solution.copy()
@@ -124,7 +124,7 @@ def test_the_residual_is_the_gradient_of_the_energy(cell, condensation):
         energies.append(equations.energy(z))
     assert slope != 0.0
     assert close((energies[0] - energies[1]) / (2 * step), slope, 1e-6)
-    contact.acting.release_friction_bound()
+    contact.effective_law.release_friction_bound()
 
 
 @pytest.mark.parametrize(("factor", "friction"), [(1e6, 0.0), (1e8, 0.0), (1e4, 0.3)])
@@ -159,13 +159,13 @@ def test_each_cycle_gains_a_constant_factor_in_proportion_to_friction(cell, monk
         law = fc.Coulomb(friction, k_n=2e4, k_t=1e4)
         n = 6 if cell == "triangle" else 3
         _, problem, contact = pressed(cell, law, "alternating", n=n, side=0.0)
-        fix, bounds = contact.acting.fix_friction_bound, []
+        fix, bounds = contact.effective_law.fix_friction_bound, []
 
         def note(bound, fix=fix, bounds=bounds):
             bounds.append(bound.copy())
             fix(bound)
 
-        monkeypatch.setattr(contact.acting, "fix_friction_bound", note)
+        monkeypatch.setattr(contact.effective_law, "fix_friction_bound", note)
         r = problem.solve().contacts["contact"]
         zones.append((r.stick, r.slip))
         bounds.append(contact.values.friction_bound.copy())

@@ -52,7 +52,16 @@ BY_RELEASE = {
 }
 KNOWN = {
     *("problem", "contact", "system", "solver", "operator", "unknowns", "verdict", "law", "bulk"),
-    *("equations", "method", "surface", "quadrature", "judge", "motions", "opposite", "obstacle"),
+    *(
+        "equations",
+        "method",
+        "surface",
+        "quadrature",
+        "verifier",
+        "motions",
+        "contact_kinematics",
+        "obstacle",
+    ),
 }
 
 
@@ -240,7 +249,7 @@ BROKEN = {
     "a room above, late": lambda: upwards(
         "checks", "def f():\n    import fenics_contact.methods.solver"
     ),
-    "a room apart": lambda: upwards("methods", "from fenics_contact.checks import judge"),
+    "a room apart": lambda: upwards("methods", "from fenics_contact.checks import verifier"),
     "a room from the ground": lambda: upwards("compat", "import fenics_contact.laws.base"),
     "the whole package": lambda: upwards("problem", "import fenics_contact as fc"),
     "a name of the whole package": lambda: upwards("histories", "from fenics_contact import Law"),

@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 
 import fenics_contact as fc
-from fenics_contact.methods import rounds as module
+from fenics_contact.methods import augmented_lagrangian as module
 from scenes.blocks import RIGHT, TOP, block, bulge
 from scenes.comparing import raised_everywhere
 from scenes.rubber import rubber
@@ -41,7 +41,7 @@ def test_failure_leaves_no_trace(what: str, monkeypatch: pytest.MonkeyPatch) -> 
     else:
         problem.snes.setTolerances(max_it=0)
         problem.solver.main.max_it = 0
-        problem.solver.starts.predict = False  # that guess can be the solution
+        problem.solver.predictor.predict = False  # that guess can be the solution
     scene.load(up=-30.0, side=5.0)
     words = (
         ("augmented Lagrangian method has not converged",) if what == "rounds" else ("increment 2",)

@@ -10,10 +10,10 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from fenics_contact.systems.candidates import touched
+from fenics_contact.systems.candidate_dofs import touched
 from fenics_contact.systems.condensation import Condensation
 from fenics_contact.systems.condensed import worthwhile
-from fenics_contact.systems.unknowns import Selection
+from fenics_contact.systems.unknowns import DofSubset
 from scenes.blocks import CELLS, GRID, LEFT, RIGHT, TOP, block, kirchhoff
 from scenes.comparing import (
     at_points,
@@ -83,7 +83,7 @@ def test_schur_complement(cell, degree, symmetric):
     for i in range(scene.dim):
         dofs = scene.facet_dofs(LEFT, i)
         mine[dofs[dofs < whole.n_local]] = True
-    selection = Selection(whole, touches)
+    selection = DofSubset(whole, touches)
     made = Condensation(problem.full.bulk.stiffness, problem.full.bulk, selection, mine)
     held, kept = gathered(COMM, mine) > 0.5, gathered(COMM, whole.first + touches)
     assert np.array_equal(kept, selection.numbers)
@@ -122,7 +122,7 @@ def test_nothing_holds_a_part():
     """A stiffness that is singular with the kept unknowns held is refused, on all ranks."""
     scene = block("triangle")
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
-    none = Selection(problem.full.unknowns, np.zeros(0, dtype=np.int32))
+    none = DofSubset(problem.full.unknowns, np.zeros(0, dtype=np.int32))
     free = np.zeros(problem.full.unknowns.n_local, dtype=bool)
     scene.E.value = 0.0
     problem.full.bulk.update()

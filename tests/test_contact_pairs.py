@@ -29,7 +29,11 @@ from scenes.meshes import mesh_of
 from scenes.tags import either, near, tagged
 
 COMM = MPI.COMM_WORLD
-pytestmark = [pytest.mark.hexahedra, pytest.mark.three_ranks, pytest.mark.timeout(120)]
+pytestmark = [
+    pytest.mark.hexahedra,
+    pytest.mark.three_ranks,
+    pytest.mark.timeout(120),
+]
 FLOOR, ROOF, WEST, SOUTH = 1, 2, 3, 4
 
 # ---- scenes --------------------------------------------------------------------------------------

@@ -81,8 +81,8 @@ def test_a_commit_that_fails_while_pairs_are_found(monkeypatch):
             kept(*args, **kwargs)
             raise MemoryError("on purpose")
 
-        kept = made.contact.opposite.find_pairs
-        patch.setattr(made.contact.opposite, "find_pairs", broken)
+        kept = made.contact.contact_kinematics.find_pairs
+        patch.setattr(made.contact.contact_kinematics, "find_pairs", broken)
         with pytest.raises(MemoryError):
             made.problem.commit()
     for each in (made, twin):

@@ -182,7 +182,7 @@ def test_without_friction_the_tangent_is_symmetric():
     """The tractions are minus the gradient of the potential, ½ k ⟨-d⟩²: by differences, to 1e-6."""
     scene = rubber("tetrahedron", 1, n=(4, 2))
     contact = scene.contact(disc(scene, 0.8, displacement=(0, 0, -0.2)), fc.Frictionless(K))
-    assert contact.acting.has_potential
+    assert contact.effective_law.has_potential
     comm, operator = scene.mesh.comm, fc.ContactOperator(contact)
     direction = fem.Function(scene.u.function_space)
     direction.interpolate(wave(3, 1))

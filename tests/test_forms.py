@@ -19,7 +19,11 @@ from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block_mesh
 from scenes.comparing import at_points, close, nodal, raised_everywhere
 from scenes.elasticity import displacement_space, hold, strain, stress
 
-pytestmark = [pytest.mark.newest, pytest.mark.two_ranks, pytest.mark.timeout(240)]
+pytestmark = [
+    pytest.mark.newest,
+    pytest.mark.two_ranks,
+    pytest.mark.timeout(240),
+]
 COMM = MPI.COMM_WORLD
 TIGHT = {"snes_rtol": 1e-13}
 LOWER, UPPER = 1, 2

@@ -182,17 +182,17 @@ def test_the_tangent_has_the_slip_distance(cell, kinematics):
                 + step * wave(d, 3)(x)
             )
         )
-        return contact.acting.traction().copy()
+        return contact.effective_law.traction().copy()
 
     step = 1e-6
     change = (at(step) - at(-step)) / (2 * step)
     at(0.0)
     contact.evaluate()
     assert np.all(contact.status == 2)  # slip
-    by_jump = contact.acting.tangent().by_jump
+    by_jump = contact.effective_law.tangent().by_jump
     jump = fem.Function(scene.u.function_space)
     jump.interpolate(wave(d, 3))
     scene.u.x.array[:] = jump.x.array
-    direction = contact.opposite.present_jump()
+    direction = contact.contact_kinematics.present_jump()
     exact = np.einsum("qij,qj->qi", by_jump, direction)
     assert close(gathered(COMM, change), gathered(COMM, exact), 1e-6)

@@ -56,7 +56,8 @@ def solve(scene, **options):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize(
-    "part", [part if part < 5 else pytest.param(part, marks=pytest.mark.slow) for part in range(10)]
+    "part",
+    [part if part < 5 else pytest.param(part, marks=pytest.mark.slow) for part in range(10)],
 )
 def test_scenes_are_not_wrong(part):
     # All scenes on one rank, every fifth on several.

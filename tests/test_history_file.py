@@ -227,7 +227,7 @@ def test_what_is_no_file_is_refused_and_stays(tmp_path):
 
     for options in ({"csv": pipe}, {"checkpoint": pipe}):
         raised_everywhere(call(**options), ValueError, "pipe", "give the name of a file")
-    with pytest.raises(ValueError, match="would replace"), files.replacing(pipe) as path:
+    with pytest.raises(ValueError, match="would replace"), files.atomic_write(pipe) as path:
         path.write_bytes(b"")
     assert pipe.is_fifo() and os.listdir(folder) == ["pipe"]
     assert made.problem.increment == 0

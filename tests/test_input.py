@@ -13,7 +13,11 @@ from scenes.comparing import raised_everywhere
 from scenes.elasticity import strain, stress
 from scenes.sound import MESH, build_and_solve, coulomb, pressed
 
-pytestmark = [pytest.mark.newest, pytest.mark.two_ranks, pytest.mark.timeout(120)]
+pytestmark = [
+    pytest.mark.newest,
+    pytest.mark.two_ranks,
+    pytest.mark.timeout(120),
+]
 COMM = MPI.COMM_WORLD
 
 

@@ -22,7 +22,11 @@ from scenes.comparing import raised_everywhere
 from scenes.meshes import mesh_of, one_rank_each
 
 COMM = MPI.COMM_WORLD
-pytestmark = [pytest.mark.hexahedra, pytest.mark.three_ranks, pytest.mark.timeout(120)]
+pytestmark = [
+    pytest.mark.hexahedra,
+    pytest.mark.three_ranks,
+    pytest.mark.timeout(120),
+]
 EXACT = 1e-12
 LOWER_HALF, REST = 7, 3
 

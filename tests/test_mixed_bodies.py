@@ -17,7 +17,11 @@ from scenes.rubber import MIXED, TIGHT, mixed_space, split
 from scenes.tags import plane, sides
 from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, two_blocks
 
-pytestmark = [pytest.mark.newest, pytest.mark.two_ranks, pytest.mark.timeout(300)]
+pytestmark = [
+    pytest.mark.newest,
+    pytest.mark.two_ranks,
+    pytest.mark.timeout(300),
+]
 E = 1000.0
 G = E / 3  # ν = 1/2
 

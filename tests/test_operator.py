@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 import fenics_contact as fc
 from fenics_contact.systems.operator import ContactOperator
-from fenics_contact.systems.unknowns import Selection, Unknowns
+from fenics_contact.systems.unknowns import DofSubset, Unknowns
 from scenes.elasticity import displacement_space, hold, residual
 from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, Slider, two_blocks
 
@@ -52,14 +52,14 @@ def test_an_operator_does_not_change():
     contact, unknowns = slider.contact, slider.problem.full.unknowns
     kept = np.arange(0, unknowns.n_dofs, 2, dtype=np.int32)
     whole = ContactOperator(contact, unknowns)
-    part = ContactOperator(contact, Selection(unknowns, kept))
+    part = ContactOperator(contact, DofSubset(unknowns, kept))
     before = read(whole), read(part)
     slider.step(0.002, 0.0)
-    contact.confine(np.zeros(contact.quadrature.n_points, dtype=bool))
+    contact.restrict_to(np.zeros(contact.quadrature.n_points, dtype=bool))
     assert same(before[0], read(whole)) and same(before[1], read(part))
-    contact.confine()
+    contact.restrict_to()
     slider.step(0.002, 0.6)  # beyond the facets that were opposite
-    assert contact.opposite.pairs_anew
+    assert contact.contact_kinematics.updates_pairs
     assert same(before[0], read(whole)) and same(before[1], read(part))
     another = ContactOperator(contact, unknowns)
     assert not same(before[0], read(another))
@@ -75,7 +75,7 @@ def test_operators_over_several_unknowns_do_not_know_of_each_other():
     )
     unknowns = Unknowns(u.function_space)
     kept = np.arange(1, unknowns.n_dofs, 3, dtype=np.int32)
-    whole, part = (ContactOperator(contact, over) for over in (unknowns, Selection(unknowns, kept)))
+    whole, part = (ContactOperator(contact, over) for over in (unknowns, DofSubset(unknowns, kept)))
     alone = read(whole), read(part)
     u.interpolate(lambda x: np.vstack([0.1 * x[0], -0.2 * x[1]]))
     contact.evaluate()

@@ -99,7 +99,7 @@ class Pair:
 
     def force(self) -> np.ndarray:
         """Contact's part of the residual at this rank's unknowns. Collective."""
-        self.contact.opposite.update()
+        self.contact.contact_kinematics.update()
         operator = ContactOperator(self.contact)
         vector = operator.unknowns.vector()
         vector.set(0.0)

@@ -12,7 +12,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from fenics_contact import compat
-from fenics_contact.histories.places import node_places, rows_of
+from fenics_contact.histories.point_matching import node_places, rows_of
 from scenes.comparing import close, gathered, owned, raised_everywhere, shared_folder
 from scenes.elasticity import strain
 from scenes.histories import Press, differences

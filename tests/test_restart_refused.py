@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import checkpoint
-from fenics_contact.histories import archive
+from fenics_contact.histories import checkpoint_file
 from scenes.bodies import boxes
 from scenes.comparing import owned, raised_everywhere, shared_folder
 from scenes.elasticity import displacement_space, hold, residual
@@ -260,10 +260,10 @@ def test_other_formats(tmp_path):
         np.savez(path, numbers=np.ones(3), nodes=np.ones((100, 4)))
     raised_everywhere(call, ValueError, "no checkpoint")
     if COMM.rank == 0:
-        archive.write_file(path, {"format": 99}, {})
+        checkpoint_file.write_file(path, {"format": 99}, {})
     raised_everywhere(call, ValueError, "format 99")
     if COMM.rank == 0:
-        archive.write_file(path, {"anything": 1}, {"nodes": np.ones(3)})
+        checkpoint_file.write_file(path, {"anything": 1}, {"nodes": np.ones(3)})
     raised_everywhere(call, ValueError, "no checkpoint")
 
 
@@ -293,13 +293,13 @@ def spoilt(name):
 def test_arrays_that_are_none_of_a_state(what, how, saved):
     """A file that is whole, with numbers that are none or of another kind."""
     if COMM.rank == 0:
-        scene, arrays = archive.read_file(saved)
+        scene, arrays = checkpoint_file.read_file(saved)
         change = spoilt(how)
         if change is None:
             del arrays[what]
         else:
             arrays[what] = np.asarray(change(arrays[what]))
-        archive.write_file(saved, scene, arrays)
+        checkpoint_file.write_file(saved, scene, arrays)
     COMM.barrier()
     made = Press(wall=True)
     call = lambda: next(made.increments(checkpoint=saved))  # noqa: E731

@@ -310,7 +310,7 @@ def test_friction_that_turns_with_slip_is_part_of_the_estimate(transverse, cell,
     assert scene.mesh.comm.allreduce(int(slips.sum())) > 0
     flat = np.eye(d) - np.einsum("qi,qj->qij", normal, normal)
     found = flat @ spring_stiffness(contact) @ flat
-    exact = -flat @ contact.acting.tangent().by_jump @ flat
+    exact = -flat @ contact.effective_law.tangent().by_jump @ flat
     largest = COMM.allreduce(np.abs(exact[slips]).max(initial=0.0), op=MPI.MAX)
     assert (largest > 1.0) == (d == 3)
     assert COMM.allreduce(np.abs((found - exact)[slips]).max(initial=0.0), op=MPI.MAX) < 1e-9 * 1e3

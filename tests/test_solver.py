@@ -30,7 +30,11 @@ from scenes.comparing import (
 from scenes.rubbing import PATH, Rub, snapshot, walk
 from scenes.stacks import FLOOR, ROOF, joint, stack
 
-pytestmark = [pytest.mark.newest, pytest.mark.two_ranks, pytest.mark.timeout(240)]
+pytestmark = [
+    pytest.mark.newest,
+    pytest.mark.two_ranks,
+    pytest.mark.timeout(240),
+]
 COMM = MPI.COMM_WORLD
 
 # Solver tolerances for comparisons finer than the default of 1e-9 of the forces.

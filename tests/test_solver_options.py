@@ -8,13 +8,17 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from fenics_contact.methods.method import OwnMethod, Tools
+from fenics_contact.methods.method import SolverContext, StandaloneMethod
 from fenics_contact.methods.solver import METHODS
 from scenes.blocks import TOP
 from scenes.comparing import at_points, close, gathered, nodal, raised_everywhere
 from scenes.rubbing import PATH, Rub, pressed, same_states, walk
 
-pytestmark = [pytest.mark.newest, pytest.mark.two_ranks, pytest.mark.timeout(240)]
+pytestmark = [
+    pytest.mark.newest,
+    pytest.mark.two_ranks,
+    pytest.mark.timeout(240),
+]
 COMM = MPI.COMM_WORLD
 
 
@@ -204,13 +208,13 @@ def test_types_of_snes_that_cannot_work(kind):
     )
 
 
-class Plain(OwnMethod):
+class Plain(StandaloneMethod):
     """Newton's method without a line search: all that a new method has to say."""
 
-    def __init__(self, tools: Tools) -> None:
+    def __init__(self, context: SolverContext) -> None:
         """One SNES."""
         options = {"snes_linesearch_type": "basic", "snes_max_it": 50}
-        self._newton = tools.newton("plain_", options)
+        self._newton = context.newton("plain_", options)
 
     def solve(self) -> tuple[int, int]:
         """See `Method.solve`."""

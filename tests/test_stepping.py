@@ -14,7 +14,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from fenics_contact.histories import archive
+from fenics_contact.histories import checkpoint_file
 from scenes.blocks import TOP, block
 from scenes.comparing import close, owned, raised_everywhere, shared_folder
 from scenes.processes import command, environment
@@ -238,7 +238,7 @@ def test_a_failed_write_leaves_the_old_file(said, tmp_path, monkeypatch):
     if said:
         monkeypatch.setattr(np, "savez", full)
     else:
-        monkeypatch.setattr(archive, "open", lossy, raising=False)
+        monkeypatch.setattr(checkpoint_file, "open", lossy, raising=False)
     words = "No space left" if said else "differs from what was written"
     raised_everywhere(lambda: next(history), (OSError, RuntimeError), words)
     assert path.read_bytes() == before

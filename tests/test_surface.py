@@ -34,7 +34,11 @@ from scenes.comparing import (
 )
 from scenes.elasticity import displacement_space
 
-pytestmark = [pytest.mark.hexahedra, pytest.mark.three_ranks, pytest.mark.timeout(120)]
+pytestmark = [
+    pytest.mark.hexahedra,
+    pytest.mark.three_ranks,
+    pytest.mark.timeout(120),
+]
 COMM = MPI.COMM_WORLD
 
 

@@ -125,7 +125,7 @@ def test_derivatives(cell, shape):
             ways += [unknowns.joined(direction, 0 * angle), unknowns.joined(direction, angle)]
             for way in ways:
                 assert max(difference(problem, contact, state, way)) < 1e-6
-            if contact.acting.has_potential:
+            if contact.effective_law.has_potential:
                 tangent = problem.full.operators[0].tangent()
                 mirrored = tangent.copy().transpose()
                 mirrored.axpy(-1.0, tangent)

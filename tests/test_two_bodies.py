@@ -23,7 +23,11 @@ from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, E, pressed, two_blocks
 
 COMM = MPI.COMM_WORLD
 
-pytestmark = [pytest.mark.newest, pytest.mark.three_ranks, pytest.mark.hexahedra]
+pytestmark = [
+    pytest.mark.newest,
+    pytest.mark.three_ranks,
+    pytest.mark.hexahedra,
+]
 
 
 @pytest.mark.parametrize("nu", [0.0, 0.3])

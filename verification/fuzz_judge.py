@@ -17,7 +17,7 @@ import scipy.spatial.distance
 from verification import fuzz_reference, fuzz_scenes
 from verification import reference_solver as reference
 
-__all__ = ["MAX_PENETRATION", "Judge", "sample_surface"]
+__all__ = ["MAX_PENETRATION", "Verifier", "sample_surface"]
 
 Array = np.ndarray
 
@@ -70,7 +70,7 @@ def sample_surface(surface: Any, u: Array, n: int = 9) -> tuple[Array, Array, Ar
     return surface.position(facet, xi, u)[0], surface.position(facet, xi)[0], facet
 
 
-class Judge:
+class Verifier:
     """Compares the package's increments, one by one.
 
     Attributes:
@@ -862,7 +862,7 @@ class Judge:
     ) -> None:
         """Update pairs at a committed state, and with them the slip reference."""
         for i, reported in enumerate(record["contacts"]):
-            if reported["pairs_anew"]:
+            if reported["updates_pairs"]:
                 self._update_pairs_of(problem, states, i, u, u)
 
     @staticmethod

@@ -16,7 +16,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import compat
-from fenics_contact.contact.opposite import ObstacleMotion
+from fenics_contact.contact.contact_kinematics import ObstacleMotion
 from fenics_contact.types import Array
 from verification import fuzz_features, fuzz_forms
 from verification.fuzz_scenes import TOP, Scene, frictions
@@ -577,10 +577,10 @@ def _record_slip_resets(setup: SceneSetup, contact: fc.Contact) -> None:
         begin(opposite)
 
     begin, contact.states.begin_between = contact.states.begin_between, begin_between  # type: ignore[method-assign]
-    displace = contact.opposite.displaced
-    contact.opposite.displaced = displaced  # type: ignore[method-assign]
-    count = contact.states.count_slip_from_here
-    contact.states.count_slip_from_here = count_from_here  # type: ignore[method-assign]
+    displace = contact.contact_kinematics.displaced
+    contact.contact_kinematics.displaced = displaced  # type: ignore[method-assign]
+    count = contact.states.set_slip_reference
+    contact.states.set_slip_reference = count_from_here  # type: ignore[method-assign]
 
 
 def _make_record(
@@ -620,7 +620,7 @@ def _make_record(
                 "error": contact.accuracy.error if contact.accuracy else None,
                 "slip_reset": setup.slip_resets.get(contact.name),
                 "paired_at": setup.paired_at.get(contact.name),
-                "pairs_anew": contact.opposite.pairs_anew,
+                "updates_pairs": contact.contact_kinematics.updates_pairs,
             }
         )
     return {

@@ -58,17 +58,19 @@ class CrossCheck:
             stands where the obstacle is rigid and no motion of it is unknown, and the jump at the
             points otherwise.
         """
-        opposite = contact.opposite
+        opposite = contact.contact_kinematics
         opposite.update()
         vector, forces = opposite.pairs.own_map.createVecs()
-        traction = contact.acting.own.evaluate_traction()
+        traction = contact.effective_law.own.evaluate_traction()
         forces.array[:] = (contact.area[:, None] * traction).ravel()
         opposite.pairs.own_map.multTranspose(forces, vector)
         by_points = vector.array_r.copy()
         for item in (vector, forces):
             item.destroy()
         if contact.name not in self._forms:
-            displacement = contact.u if contact.rigid and not contact.motions else opposite.felt
+            displacement = (
+                contact.u if contact.rigid and not contact.motions else opposite.local_jump
+            )
             form = contact.form_at(displacement, ufl.TestFunction(contact.u.function_space))
             self._forms[contact.name] = compile_form(-form, contact.entity_maps)
         return by_points, assembled(self._forms[contact.name])[: by_points.size].copy()

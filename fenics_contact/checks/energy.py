@@ -65,13 +65,13 @@ class EnergyState:
     """Forces and displacements of a state on this rank; two states determine an `Energy`.
 
     Attributes:
-        forces: Forces at the unknowns, by the mark of their coordinates.
+        forces: Forces at the unknowns, by the coordinate_id of their coordinates.
         contacts: For each contact, tractions on the body, displacement relative to the obstacle,
             and prescribed displacement of the obstacle, (3, n_points, gdim). If the obstacle
             rotates: tractions, displacement relative to the obstacle in its frame, displacement of
             the body minus the unknown motion of the obstacle, and the axes of the frame,
-            (3 + gdim, n_points, gdim); with a given moment also `Opposite.turning_rate` and the
-            angle.
+            (3 + gdim, n_points, gdim); with a given moment also
+            `ContactKinematics.turning_rate` and the angle.
         springs: For each contact, the energy in the contact springs at the points, (n_points,).
     """
 
@@ -91,14 +91,14 @@ class EnergyState:
         springs = [np.asarray(c.measure * c.values.stored) for c in contacts]
         return cls(forces, [_ways(c, c.traction) for c in contacts], springs)
 
-    def with_forces(self, mark: Any, forces: Forces) -> EnergyState:
+    def with_forces(self, coordinate_id: Any, forces: Forces) -> EnergyState:
         """Return this state with the forces in other coordinates, too."""
-        return dataclasses.replace(self, forces={**self.forces, mark: forces})
+        return dataclasses.replace(self, forces={**self.forces, coordinate_id: forces})
 
     def between(self, contacts: Sequence[Contact]) -> EnergyState:
         """Return this state, the committed one, with relative displacements of the new pairs."""
         ways = [
-            np.stack([way[0], contact.opposite.committed_jump, *way[2:]])
+            np.stack([way[0], contact.contact_kinematics.committed_jump, *way[2:]])
             for way, contact in zip(self.contacts, contacts, strict=True)
         ]
         return dataclasses.replace(self, contacts=ways)
@@ -107,8 +107,10 @@ class EnergyState:
         self, before: EnergyState, contacts: Sequence[Contact], scales: ReferenceScales
     ) -> Energy:
         """Return the energies between the state ``before`` and this one. Collective."""
-        mark = next(mark for mark in self.forces if mark in before.forces)
-        old, new = before.forces[mark], self.forces[mark]
+        coordinate_id = next(
+            coordinate_id for coordinate_id in self.forces if coordinate_id in before.forces
+        )
+        old, new = before.forces[coordinate_id], self.forces[coordinate_id]
         way = new.unknowns - old.unknowns
         groups = scales.group[new.label]
         # Work, elastic, springs, dissipation, work of the tractions, that of friction, its size,
@@ -130,7 +132,7 @@ class EnergyState:
             add(2, has - had, groups)
             mean = contact.measure[:, None] * 0.5 * (there[0] + here[0])
             relative, carried = here[1] - there[1], here[2] - there[2]
-            if contact.opposite.turns:
+            if contact.contact_kinematics.turns:
                 # Half-way between both ends, else a normal pressure works on what turns beneath it.
                 d = here.shape[2]
                 axes = 0.5 * (there[3 : 3 + d] + here[3 : 3 + d])
@@ -181,10 +183,10 @@ class EnergyState:
 def _ways(contact: Contact, traction: Array) -> Array:
     """A contact's part of `EnergyState.contacts`."""
     jump = contact.values.jump
-    if not contact.opposite.turns:
+    if not contact.contact_kinematics.turns:
         return np.stack([traction, jump, contact.values.shift])
     units = np.eye(jump.shape[1])
-    axes = [contact.opposite.turned(np.broadcast_to(unit, jump.shape)) for unit in units]
+    axes = [contact.contact_kinematics.turned(np.broadcast_to(unit, jump.shape)) for unit in units]
     # The work of forces that move the obstacle is that of the loads.
     own = contact.own_displacement()
     for component, motion in contact.free_motion.items():
@@ -192,7 +194,7 @@ def _ways(contact: Contact, traction: Array) -> Array:
     ways = [traction, jump, own, *axes]
     if contact.free_angle is not None:
         angle = float(contact.free_angle.value)
-        ways += [contact.opposite.turning_rate(), np.full_like(jump, angle)]
+        ways += [contact.contact_kinematics.turning_rate(), np.full_like(jump, angle)]
     return np.stack(ways)
 
 

@@ -206,10 +206,10 @@ class Deviation:
         values, closed = contact.values, contact.status != Status.OPEN
         zero, nothing = np.zeros(len(closed)), np.zeros(len(closed), dtype=np.bool_)
         none = cls(zero, np.zeros_like(values.normal), values.normal, nothing, nothing)
-        exact = contact.finite or contact.opposite.is_flat
+        exact = contact.finite or contact.contact_kinematics.is_flat
         if exact or not (contact.rigid or _moves(contact)):
             return none
-        change, normal = contact.opposite.deviation(values)
+        change, normal = contact.contact_kinematics.deviation(values)
         if not contact.rigid:
             # It jumps from point to point; what is answered to is a function on Γc.
             paired = contact.paired & ~np.isnan(change)
@@ -276,7 +276,10 @@ def linearisation(
         [part for part in _parts(c, scales, i) if _matters(c, deviation, part, scales.modulus(i))]
         for i, (c, deviation) in enumerate(zip(contacts, deviations, strict=True))
     ]
-    slides = [(c.opposite.largest_slide(c.values), c.opposite.slide_limit) for c in contacts]
+    slides = [
+        (c.contact_kinematics.largest_slide(c.values), c.contact_kinematics.slide_limit)
+        for c in contacts
+    ]
     if not any(looked_at):
         none = 0.0, 0.0, False
         return {c.name: Linearisation(*none, *s) for c, s in zip(contacts, slides, strict=True)}

@@ -67,7 +67,7 @@ class RigidObstacleProbe:
         before: fem.Function | None = None,
         known: RigidObstacleProbe | None = None,
     ) -> None:
-        opposite, values = contact.opposite, contact.values
+        opposite, values = contact.contact_kinematics, contact.values
         assert opposite.sampler is not None
         self.places = places = contact.facet_places
         self.sampler = opposite.sampler
@@ -105,7 +105,7 @@ class RigidObstacleProbe:
 
         Without u, the displacement, no more of it than the points carry.
         """
-        opposite, values = contact.opposite, contact.values
+        opposite, values = contact.contact_kinematics, contact.values
         return self.places.at_nodes(
             values.x + values.jump,
             u,
@@ -159,7 +159,7 @@ class RigidObstacleProbe:
 
     def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
         """Whether points and shape of this rank are those of the last commit, in its frame."""
-        committed = contact.values.x + contact.opposite.committed_jump
+        committed = contact.values.x + contact.contact_kinematics.committed_jump
         is_shape = np.array_equal(self._shape, self.sampler.committed_shape)
         return bool(is_shape and np.array_equal(self.points, committed))
 
@@ -168,7 +168,9 @@ class RigidObstacleProbe:
 
         The obstacle must not turn or change its shape, and no place move more than it is clear.
         """
-        known = np.array_equal(self._shape, self.sampler.shape) and not contact.opposite.turns
+        known = (
+            np.array_equal(self._shape, self.sampler.shape) and not contact.contact_kinematics.turns
+        )
         moved = self._at(self._in_frame(contact, contact.u)) - self.z
         size = self.places.size[self.facet]
         clear = DEPTH_RESOLUTION * size + self.distance

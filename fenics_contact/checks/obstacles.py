@@ -46,18 +46,18 @@ class ObstacleCheck:
     def of(cls, contact: Contact) -> ObstacleCheck:
         """Evaluate the obstacle of a contact at its evaluated state. Collective."""
         comm, closed = contact.surface.mesh.comm, contact.status != Status.OPEN
-        errors, depth = contact.opposite.gradient_error(contact.values), 0.0
+        errors, depth = contact.contact_kinematics.gradient_error(contact.values), 0.0
         if contact.finite:
             # No law takes a gap for closed that is not a number, or has no normal.
-            gap, _ = contact.opposite.true_placement(contact.values)
+            gap, _ = contact.contact_kinematics.true_placement(contact.values)
             errors = np.where(np.isnan(gap), np.nan, errors)
             closed |= ~(gap > 0) & np.isnan(errors)
         error = global_max(comm, errors[closed])
-        curvature = contact.opposite.largest_curvature()
+        curvature = contact.contact_kinematics.largest_curvature()
         if curvature is not None and not contact.obstacle.is_flat:
             depth = global_max(comm, (contact.values.penetration * curvature)[closed])
         rubs = contact.law.has_friction and comm.allreduce(int(closed.any())) > 0
-        turn = abs(contact.opposite.turned_by(contact.values)) if rubs else 0.0
+        turn = abs(contact.contact_kinematics.turned_by(contact.values)) if rubs else 0.0
         return cls(type(contact.obstacle).__name__, error, depth, turn)
 
     def conditions(self, contact: str) -> list[Condition]:

@@ -25,7 +25,7 @@ def warn_of_few_points(contact: Contact) -> bool:
     If the radius is known when the contact is created, `ContactSurface` uses enough points.
     """
     quadrature, comm = contact.quadrature, contact.surface.mesh.comm
-    curvature = contact.opposite.largest_curvature()
+    curvature = contact.contact_kinematics.largest_curvature()
     if curvature is None or quadrature.asked:
         return False
     per_radius = curvature * quadrature.facet_sizes
@@ -52,7 +52,7 @@ def warn_of_divided_facets(contact: Contact) -> bool:
 
     Its position along a facet is resolved to half of the distance between two quadrature points.
     """
-    if not contact.opposite.follows:
+    if not contact.contact_kinematics.follows:
         return False
     comm, points = contact.surface.mesh.comm, contact.quadrature.point_rows
     paired = contact.values.paired[points]

@@ -52,7 +52,7 @@ class Tunnelling:
 
     @classmethod
     def of(cls, comm: MPI.Comm, probe: _Probe, resisted: ResistedDepth) -> Tunnelling:
-        """Judge the places of one contact, by what the points of all resist. Collective."""
+        """Verifier the places of one contact, by what the points of all resist. Collective."""
         depth, allowed = probe.depth(resisted)
         worst = _worst(comm, depth - allowed, np.column_stack([depth, allowed, probe.x]))
         through = probe.crossed(allowed)
@@ -97,14 +97,14 @@ class TunnellingCheck:
         self._contacts = [
             c
             for c in contacts
-            if not c.gap_prescribed and (not c.rigid or c.opposite.sampler is not None)
+            if not c.gap_prescribed and (not c.rigid or c.contact_kinematics.sampler is not None)
         ]
         # By contact the last probe of a committed state, and the last one.
         self._committed: dict[str, Any] = {}
         self._last: dict[str, Any] = {}
 
     def evaluate(self, before: fem.Function | None) -> dict[str, Tunnelling]:
-        """Judge the contacts, evaluated at the end of an increment, by their names. Collective.
+        """Verifier the contacts, evaluated at the end of an increment, by their names. Collective.
 
         Without the displacement at the last commit paths are not followed.
         """

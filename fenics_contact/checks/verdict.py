@@ -11,7 +11,7 @@ from fenics_contact.checks.kinematics import Linearisation
 from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.tunnelling import Tunnelling
 from fenics_contact.contact.contact import Contact
-from fenics_contact.markup import shown
+from fenics_contact.markup import html_table
 from fenics_contact.parallel import global_max, global_min, longest
 from fenics_contact.systems.balance import MOST_EXCUSED
 from fenics_contact.types import Array
@@ -175,7 +175,7 @@ class Verdict:
         rows = [(each.name, f"{each.value:.2e}", f"{each.limit:.2e}") for each in conditions]
         failures = [each.failure for each in conditions if not each.holds]
         title = "Verdict: " + ("does not hold" if failures else "holds")
-        return shown(title, ("condition", "error", "limit"), rows, failures)
+        return html_table(title, ("condition", "error", "limit"), rows, failures)
 
     @property
     def is_finite(self) -> bool:
@@ -353,8 +353,8 @@ def check_laws(contact: Contact) -> dict[str, float]:
         return found
 
     bound, beta = v.friction_bound, v.slip_increment
-    contact.opposite.update()
-    functions, gradients = (rows[paired] for rows in contact.acting.own.evaluate_yield())
+    contact.contact_kinematics.update()
+    functions, gradients = (rows[paired] for rows in contact.effective_law.own.evaluate_yield())
     missing = contact.slip_vector()[paired]  # = -Σ Δβ_j ∂g_j/∂τ (44)
     change = missing - v.increment
     # An open point keeps no traction and counts no slip, whatever it moves.

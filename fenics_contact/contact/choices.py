@@ -6,41 +6,41 @@ from typing import Any
 
 from fenics_contact.arguments import is_number
 from fenics_contact.contact.accuracy import Accuracy
-from fenics_contact.contact.body import BodyOpposite, FollowedOpposite
-from fenics_contact.contact.rigid import MovingOpposite, RigidOpposite
+from fenics_contact.contact.body import BodyFinite, BodySmall
+from fenics_contact.contact.rigid import RigidFinite, RigidSmall
 from fenics_contact.laws.base import Law
 from fenics_contact.laws.stiffness import NodalSprings
 from fenics_contact.obstacles.base import Obstacle
 from fenics_contact.obstacles.deformable import DeformableBody
 
-__all__ = ["enforcement_of", "is_regularised", "kind_of_opposite"]
+__all__ = ["enforcement_of", "is_regularised", "kinematics_class"]
 
 
 _ENFORCEMENTS = ("penalty", "augmented")
-OppositeKind = type[RigidOpposite] | type[BodyOpposite] | type[MovingOpposite]
+KinematicsClass = type[RigidSmall] | type[BodySmall] | type[RigidFinite]
 # By kinematics, of a rigid obstacle and of another body.
-_OPPOSITES: dict[str, tuple[OppositeKind, OppositeKind]] = {
-    "small": (RigidOpposite, BodyOpposite),
-    "finite": (MovingOpposite, FollowedOpposite),
+_KINEMATICS: dict[str, tuple[KinematicsClass, KinematicsClass]] = {
+    "small": (RigidSmall, BodySmall),
+    "finite": (RigidFinite, BodyFinite),
 }
 # Of augmented enforcement, where nothing is said.
 _TOLERANCE = 1e-5
 
 
-def kind_of_opposite(
+def kinematics_class(
     name: str, kinematics: str, obstacle: Obstacle, law: Law, gap: Any
-) -> OppositeKind:
-    """What lies opposite, by what was given to `Contact`: a class that is made of `Parts`.
+) -> KinematicsClass:
+    """What lies opposite, by what was given to `Contact`: a class that is made of `ContactParts`.
 
     Raises:
         ValueError: ``kinematics`` is unknown, or something was given that has no sense with it.
     """
-    if kinematics not in _OPPOSITES:
+    if kinematics not in _KINEMATICS:
         raise ValueError(
-            f"{name}: kinematics is {kinematics!r}; use one of {tuple(_OPPOSITES)} (a tolerance of "
-            "small displacements is ContactProblem(small_displacement_tolerance=...))"
+            f"{name}: kinematics is {kinematics!r}; use one of {tuple(_KINEMATICS)} (a "
+            "tolerance of small displacements is ContactProblem(small_displacement_tolerance=...))"
         )
-    rigid, body = _OPPOSITES[kinematics]
+    rigid, body = _KINEMATICS[kinematics]
     found = body if isinstance(obstacle, DeformableBody) else rigid
     if not found.is_finite:
         if obstacle.rotation is not None:

@@ -11,11 +11,11 @@ from dolfinx import fem
 
 from fenics_contact.arguments import check_instance
 from fenics_contact.contact.accuracy import Accuracy
-from fenics_contact.contact.acting import ActingLaw
-from fenics_contact.contact.choices import enforcement_of, kind_of_opposite
+from fenics_contact.contact.choices import enforcement_of, kinematics_class
+from fenics_contact.contact.contact_kinematics import ContactKinematics, ContactParts
+from fenics_contact.contact.effective_law import EffectiveLaw
 from fenics_contact.contact.inputs import Inputs, varies
 from fenics_contact.contact.multipliers import Multipliers, TraceProjection
-from fenics_contact.contact.opposite import Opposite, Parts
 from fenics_contact.contact.results import PointResults
 from fenics_contact.contact.states import ContactStates
 from fenics_contact.contact.values import PointValues
@@ -152,8 +152,8 @@ class Contact(PointResults):
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
         self.accuracy = None if accuracy is None else Accuracy.of(accuracy)
-        opposite_kind = kind_of_opposite(name, kinematics, obstacle, law, gap)
-        self.kinematics, self.finite = kinematics, opposite_kind.is_finite
+        kinematics_type = kinematics_class(name, kinematics, obstacle, law, gap)
+        self.kinematics, self.finite = kinematics, kinematics_type.is_finite
         augments, self.tolerance = enforcement_of(name, enforcement, tolerance, law, self.accuracy)
         # Linear elements meet a curved gap at their nodes only (docs/enforcement.md). But between
         # two meshes, and on quadrilaterals of any shape, nodes do not transfer a uniform pressure.
@@ -202,7 +202,7 @@ class Contact(PointResults):
 
         # Contact is a sparse matrix from u to the jump at the points, and the law there: as
         # expressions for the form on Γc, and evaluated at the points for everything else.
-        parts = Parts(
+        parts = ContactParts(
             name=name,
             displacement=self.displacement,
             quadrature=self.quadrature,
@@ -213,13 +213,15 @@ class Contact(PointResults):
             history=self.history,
             multipliers=None if self.multipliers is None else self.multipliers.fields,
         )
-        self.opposite: Opposite = opposite_kind(parts)
-        self.rigid, self.pairs = self.opposite.is_rigid, self.opposite.pairs
-        self.acting = ActingLaw(parts, self.opposite)
+        self.contact_kinematics: ContactKinematics = kinematics_type(parts)
+        self.rigid, self.pairs = self.contact_kinematics.is_rigid, self.contact_kinematics.pairs
+        self.effective_law = EffectiveLaw(parts, self.contact_kinematics)
         if not self.rigid:
-            self.opposite.update()
-            self.opposite.find_pairs(None, np.zeros(self.quadrature.n_points))
-        self.states = ContactStates(parts, self.multipliers, self.opposite, self.acting)
+            self.contact_kinematics.update()
+            self.contact_kinematics.find_pairs(None, np.zeros(self.quadrature.n_points))
+        self.states = ContactStates(
+            parts, self.multipliers, self.contact_kinematics, self.effective_law
+        )
 
     # ---- forms -----------------------------------------------------------------------------------
 
@@ -243,7 +245,7 @@ class Contact(PointResults):
 
     def form_at(self, displacement: Any, v: ufl.Argument) -> ufl.Form:
         """Return `form` at a displacement relative to the obstacle (UFL)."""
-        traction = self.acting.in_form.traction(displacement)
+        traction = self.effective_law.in_form.traction(displacement)
         return -self.inputs.weight * ufl.dot(traction, v) * self.quadrature.ds
 
     def _check_form(self) -> None:
@@ -273,14 +275,14 @@ class Contact(PointResults):
                 tension; friction with finite kinematics), or the contact has no `form`.
         """
         self._check_form()
-        if self.law.has_potential and not self.acting.has_potential:
+        if self.law.has_potential and not self.effective_law.has_potential:
             raise ValueError(
                 f"{self.name}: friction has no potential with finite kinematics, because the "
                 "tangent planes rotate; use Contact.form"
             )
         return (
             self.inputs.weight
-            * self.acting.in_form.potential(self.displacement.expression)
+            * self.effective_law.in_form.potential(self.displacement.expression)
             * self.quadrature.ds
         )
 
@@ -296,7 +298,7 @@ class Contact(PointResults):
     @property
     def area(self) -> Array:
         """Quadrature weights times the contact's weight as evaluated last, (n_points,)."""
-        return self.quadrature.weights * self.opposite.data.values["weight"]
+        return self.quadrature.weights * self.contact_kinematics.data.values["weight"]
 
     def energy(self) -> float:
         """Return the value of `potential` at the present ``u``, summed over this rank's points.
@@ -306,16 +308,16 @@ class Contact(PointResults):
         Raises:
             ValueError: The law has no potential.
         """
-        potential = self.acting.potential()
+        potential = self.effective_law.potential()
         return float(self.area @ potential)
 
-    def confine(self, points: Mask | None = None) -> None:
+    def restrict_to(self, points: Mask | None = None) -> None:
         """Restrict the law to some of the points; the others are open. Collective.
 
         Args:
             points: Mask of the points, (n_points,); None: all points.
         """
-        self.acting.confine(points)
+        self.effective_law.restrict_to(points)
         self.states.forget()
 
     # ---- data ------------------------------------------------------------------------------------
@@ -328,9 +330,9 @@ class Contact(PointResults):
         """
         self.surface.check_places(self.name)
         self.inputs.update()
-        self.opposite.update()
+        self.contact_kinematics.update()
         self.states.forget()
-        self.inputs.check(self.opposite.data.values, undeformed=not self.finite)
+        self.inputs.check(self.contact_kinematics.data.values, undeformed=not self.finite)
 
     # ---- pairs -----------------------------------------------------------------------------------
 
@@ -369,7 +371,7 @@ class Contact(PointResults):
         Returns:
             Arrays (n_points,) (length) and (n_points, gdim).
         """
-        return self.opposite.true_placement(self.values)
+        return self.contact_kinematics.true_placement(self.values)
 
     @cached_property
     def traces(self) -> TraceProjection:

@@ -1,4 +1,4 @@
-"""Where the obstacle of a contact is, seen from where the body has moved to."""
+"""Where the obstacle of a contact is, geometry from where the body has moved to."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class DeformedPlaces:
 
     Args:
         displacement: u at the points.
-        placement: Of the obstacle, seen from X, but displaced as it is where X has moved to.
+        placement: Of the obstacle, geometry from X, but displaced as it is where X has moved to.
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class DeformedPlaces:
         self._evaluate: PointEvaluator | None = None
 
     def __call__(self) -> tuple[Array, Array]:
-        """See `Opposite.true_placement`. Collective."""
+        """See `ContactKinematics.true_placement`. Collective."""
         if self._evaluate is None:
             x = ufl.SpatialCoordinate(self._quadrature.surface.mesh)
             moved = ufl.variable(x + self._displacement)

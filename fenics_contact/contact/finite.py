@@ -5,9 +5,9 @@ tractions are nominal, forces per undeformed area. The map from unknowns to the 
 that of small displacements; all that is nonlinear happens at the points.
 
 The history is kept in the frame of the obstacle, which moves and turns with it: a point that rests
-on a turning roller does not slip. Slip is the way of the foot, the point of the obstacle that is
-closest, x + g n; the committed traction turns with the obstacle, and then from the old normal to
-the new one by the smallest rotation.
+on a turning roller does not slip. Slip is the tangential path of the projection
+point x + g n, the closest point of the obstacle; the committed traction rotates with the obstacle,
+and then from the old normal to the new one by the smallest rotation.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import ufl
 from dolfinx import fem
 from ufl.algorithms.analysis import extract_constants, extract_type
 
-from fenics_contact.contact.kinematics import Seen, tangential
+from fenics_contact.contact.point_geometry import PointGeometry, tangential
 from fenics_contact.laws.base import Law, PointKinematics
 from fenics_contact.obstacles.base import Placement
 from fenics_contact.surface.fields import PointFields
@@ -104,7 +104,7 @@ class View:
 
 @dataclass(frozen=True)
 class ExactView:
-    """How an obstacle is seen from points that have moved: by its own expressions.
+    """How an obstacle is geometry from points that have moved: by its own expressions.
 
     Attributes:
         x: Coordinates of the undeformed Γc.
@@ -119,7 +119,7 @@ class ExactView:
     carried: Mapping[str, Any]
 
     def __call__(self, jump: Any) -> View:
-        """What is seen from X + u."""
+        """What is geometry from X + u."""
         placement = self.place(self.frame.into(self.x + jump))
         return View(placement.gap, self.frame.turned(placement.normal), self.carried)
 
@@ -130,15 +130,17 @@ def carried_history(
     """What was committed with friction, as the obstacle has carried it along since (UFL).
 
     Returns:
-        "foot", its place minus X (length); "traction" (stress) and "normal", of the multipliers
-        where there are any.
+        "projection_point", its place minus X (length); "traction" (stress) and
+        "normal", of the multipliers where there are any.
     """
-    foot, kept = history.ufl("jump"), multipliers or history
+    projection_point, kept = history.ufl("jump"), multipliers or history
     if frame.rotation is not None:
-        foot = frame.place(x + foot) - x
+        projection_point = frame.place(x + projection_point) - x
     elif frame.shift is not None:
-        foot = foot + frame.shift
-    return {"foot": foot} | {name: frame.turned(kept.ufl(name)) for name in ("traction", "normal")}
+        projection_point = projection_point + frame.shift
+    return {"projection_point": projection_point} | {
+        name: frame.turned(kept.ufl(name)) for name in ("traction", "normal")
+    }
 
 
 class SampledView:
@@ -162,18 +164,22 @@ class SampledView:
     ) -> None:
         d, frame = quadrature.surface.mesh.geometry.dim, exact.frame
         moved = ufl.variable(jump)
-        seen = exact(moved)
-        by_place, unit = ufl.diff(seen.normal, moved), ufl.Identity(d)
-        expressions = {"gap": seen.gap, "slope": ufl.diff(seen.gap, moved), "normal": seen.normal}
+        geometry = exact(moved)
+        by_place, unit = ufl.diff(geometry.normal, moved), ufl.Identity(d)
+        expressions = {
+            "gap": geometry.gap,
+            "slope": ufl.diff(geometry.gap, moved),
+            "normal": geometry.normal,
+        }
         expressions |= {f"turn {i}": by_place[i, :] for i in range(d)}
         expressions |= {"relative": frame.relative(exact.x, moved)}
         if frame.rotation is not None:
             expressions |= {f"axis {i}": frame.turned_back(unit[:, i]) for i in range(d)}
-        expressions |= {f"carried {name}": value for name, value in seen.carried.items()}
-        if seen.carried:
+        expressions |= {f"carried {name}": value for name, value in geometry.carried.items()}
+        if geometry.carried:
             old, before = (frame.turned(history.ufl(n)) for n in ("traction", "normal"))
-            expressions["committed traction"] = _turned(old, before, seen.normal)
-        self._jump, self._d, self._carried = jump, d, list(seen.carried)
+            expressions["committed traction"] = _turned(old, before, geometry.normal)
+        self._jump, self._d, self._carried = jump, d, list(geometry.carried)
         self._turns = frame.rotation is not None
         self._evaluate = PointEvaluator(quadrature, expressions)
         sizes = {name: e.ufl_shape[0] if e.ufl_shape else 0 for name, e in expressions.items()}
@@ -197,7 +203,7 @@ class SampledView:
         return np.asarray(np.einsum("qij,qi->qj" if back else "qij,qj->qi", axes, vectors))
 
     def __call__(self, jump: Any) -> View:
-        """What is seen from X + u, near the displacement that was sampled."""
+        """What is geometry from X + u, near the displacement that was sampled."""
         field, change = self._fields.ufl, jump - self._fields.ufl("at")
         gap = field("gap") + ufl.dot(field("slope"), change)
         turn = [ufl.dot(field(f"turn {i}"), change) for i in range(self._d)]
@@ -210,23 +216,23 @@ class FiniteKinematics:
     """Displacements of any size relative to a rigid obstacle; see the module.
 
     Attributes:
-        view: How the obstacle is seen from displaced points.
+        view: How the obstacle is geometry from displaced points.
         multipliers: λ_n and λ_t, which take the place of committed tractions.
     """
 
     view: Callable[[Any], View]
     multipliers: PointFields | None
 
-    def __call__(self, jump: Any, law: Law, seen: Seen) -> PointKinematics:
+    def __call__(self, jump: Any, law: Law, geometry: PointGeometry) -> PointKinematics:
         """What a law sees of a displacement of the body (UFL)."""
         view = self.view(jump)
         total = increment = traction = multiplier = None
         if self.multipliers is not None:
             multiplier = self.multipliers.ufl("pressure")
         if law.has_friction:
-            carried, foot = view.carried, jump + view.gap * view.normal
-            total = tangential(seen.relative(jump), view.normal)
-            increment = tangential(foot - carried["foot"], view.normal)
+            carried, projection_point = view.carried, jump + view.gap * view.normal
+            total = tangential(geometry.relative(jump), view.normal)
+            increment = tangential(projection_point - carried["projection_point"], view.normal)
             traction = _turned(carried["traction"], carried["normal"], view.normal)
         return PointKinematics(view.gap, view.normal, total, increment, traction, multiplier)
 

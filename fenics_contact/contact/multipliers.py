@@ -240,7 +240,7 @@ class Multipliers:
         found = {"multiplier": self.fields.values("pressure")}
         if self._law.has_friction:
             found |= {name: self.fields.values(name) for name in self._vectors}
-            found["jump"] = values.foot - values.elastic_slip
+            found["jump"] = values.projection_point - values.elastic_slip
         borne = [values.arrays[n] for n in ("normal_traction", "traction") if n in values.arrays]
         if not any(global_max(self._comm, np.abs(part)) > 0.0 for part in borne):
             # Round-off that is left of them would close points that a body just touches again.

@@ -195,7 +195,7 @@ class Pairs:
         return values
 
     def true_gap(self, values: PointValues) -> tuple[Array, Array]:
-        """See `Opposite.true_placement`. Collective."""
+        """See `ContactKinematics.true_placement`. Collective."""
         assert self.search is not None
         depth = self.depth(values.normal_displacement)
         return self.search.true_gap(values.x, self._u, depth)

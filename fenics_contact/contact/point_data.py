@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 import ufl
 from dolfinx import fem
 
-from fenics_contact.parallel import fail_together
+from fenics_contact.parallel import raise_collectively
 from fenics_contact.surface.dependence import Dependence
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
@@ -28,7 +28,7 @@ class PointData:
 
     Args:
         expressions: Scalars and vectors by name.
-        seen: Names of those that laws see.
+        geometry: Names of those that laws see.
 
     Attributes:
         values: All of them, (n_points,) or (n_points, d), as sampled by the last `update`.
@@ -42,20 +42,20 @@ class PointData:
         name: str,
         quadrature: SurfaceQuadrature,
         expressions: Mapping[str, ufl.core.expr.Expr],
-        seen: Iterable[str],
+        geometry: Iterable[str],
     ) -> None:
         self._comm = quadrature.surface.mesh.comm
         try:
             self._evaluate = PointEvaluator(quadrature, expressions)
         except Exception as error:
-            fail_together(self._comm, error)
+            raise_collectively(self._comm, error)
             refused = _refused(quadrature, expressions)
             if refused is None:
                 raise
             raise ValueError(f"{name}: {refused}") from error
         form = self._evaluate.form
         self._dependence = Dependence(form.constants(), form.coefficients())
-        shapes = {name: ufl.as_ufl(expressions[name]).ufl_shape for name in seen}
+        shapes = {name: ufl.as_ufl(expressions[name]).ufl_shape for name in geometry}
         sizes = {name: shape[0] if shape else 0 for name, shape in shapes.items()}
         self._fields = PointFields(quadrature, sizes)
         self.values: Mapping[str, Array] = {}
@@ -89,7 +89,7 @@ def _refused(
         try:
             PointEvaluator(quadrature, {name: expression})
         except Exception as error:
-            fail_together(comm, error)
+            raise_collectively(comm, error)
             if not name:
                 return None
             what = {"initial_gap": "gap"}.get(name, name.removeprefix("parameter "))

@@ -15,7 +15,7 @@ from ufl.algorithms.apply_derivatives import apply_derivatives
 from ufl.corealg.traversal import traverse_unique_terminals
 from ufl.domain import extract_unique_domain
 
-from fenics_contact.contact.kinematics import Kinematics, Seen
+from fenics_contact.contact.point_geometry import LocalKinematics, PointGeometry
 from fenics_contact.laws.base import ContactTraction, Law, PointKinematics
 from fenics_contact.laws.return_maps import positive_part
 from fenics_contact.parallel import global_max, global_min
@@ -63,27 +63,27 @@ class PointLaw:
         kinematics: What the law sees of displacements.
         jump: Displacement of the body at the points, of that opposite taken away.
         acts: 1 at points at which it acts, 0 at others (UFL); None: it acts at all.
-        given: ``seen`` as expressions on Γc, which the derivatives by ``free`` are of.
+        given: ``geometry`` as expressions on Γc, which the derivatives by ``free`` are of.
         free: Unknown components of the obstacle's displacement in these, `Inputs.free_shift`.
 
     Attributes:
         law: The law.
-        seen: What it sees of the points apart from displacements.
+        geometry: What it sees of the points apart from displacements.
     """
 
     def __init__(
         self,
         law: Law,
-        seen: Seen,
-        kinematics: Kinematics,
+        geometry: PointGeometry,
+        kinematics: LocalKinematics,
         quadrature: SurfaceQuadrature,
         jump: fem.Function,
         *,
         acts: Any,
-        given: Seen,
+        given: PointGeometry,
         free: Mapping[int, Any],
     ) -> None:
-        self.law, self.seen = law, seen
+        self.law, self.geometry = law, geometry
         self._kinematics, self._quadrature, self._jump = kinematics, quadrature, jump
         self._acts, self._given, self._free = acts, given, free
         self._gdim = quadrature.surface.mesh.geometry.dim
@@ -92,7 +92,7 @@ class PointLaw:
         """Another law at the same points, with parameters of its own."""
         return PointLaw(
             law,
-            replace(self.seen, parameters=parameters),
+            replace(self.geometry, parameters=parameters),
             self._kinematics,
             self._quadrature,
             self._jump,
@@ -107,28 +107,34 @@ class PointLaw:
         """A value at points at which the law acts, 0 at the others; None stays None."""
         return value if self._acts is None or value is None else self._acts * value
 
-    def _felt(self, jump: Any = None, seen: Seen | None = None) -> PointKinematics:
+    def _point_kinematics(
+        self, jump: Any = None, geometry: PointGeometry | None = None
+    ) -> PointKinematics:
         jump = self._jump if jump is None else jump
-        return self._kinematics(jump, self.law, seen or self.seen)
+        return self._kinematics(jump, self.law, geometry or self.geometry)
 
-    def _response(self, felt: PointKinematics, seen: Seen | None = None) -> ContactTraction:
+    def _response(
+        self, felt: PointKinematics, geometry: PointGeometry | None = None
+    ) -> ContactTraction:
         """What the law answers, nothing at points at which it does not act."""
-        response = self.law.contact_traction(felt, (seen or self.seen).parameters)
+        response = self.law.contact_traction(felt, (geometry or self.geometry).parameters)
         parts = {f.name: getattr(response, f.name) for f in fields(response)}
         slip = tuple(self._there(mode) for mode in parts.pop("slip"))
         return replace(response, **{n: self._there(v) for n, v in parts.items()}, slip=slip)
 
-    def traction(self, jump: Any, seen: Seen | None = None) -> Any:
+    def traction(self, jump: Any, geometry: PointGeometry | None = None) -> Any:
         """r_n n + τ on the body, at a displacement (UFL)."""
-        seen = seen or self.seen
-        felt = self._felt(jump, seen)
-        response = self._response(felt, seen)
+        geometry = geometry or self.geometry
+        felt = self._point_kinematics(jump, geometry)
+        response = self._response(felt, geometry)
         total = response.normal_traction * felt.normal
         return total if response.traction is None else total + response.traction
 
     def potential(self, jump: Any = None) -> Any:
         """Potential per area, at a displacement (UFL)."""
-        return self._there(self.law.potential(self._felt(jump), self.seen.parameters))
+        return self._there(
+            self.law.potential(self._point_kinematics(jump), self.geometry.parameters)
+        )
 
     # ---- as numbers ------------------------------------------------------------------------------
 
@@ -166,8 +172,8 @@ class PointLaw:
     @cached_property
     def _by_shift(self) -> PointEvaluator:
         """By the free displacement of the obstacle, in its own expressions."""
-        seen = replace(self._given, parameters=self.seen.parameters)
-        traction = self.traction(self._jump, seen)
+        geometry = replace(self._given, parameters=self.geometry.parameters)
+        traction = self.traction(self._jump, geometry)
         columns = {str(i): ufl.diff(traction, shift) for i, shift in self._free.items()}
         return PointEvaluator(self._quadrature, columns)
 
@@ -183,8 +189,8 @@ class PointLaw:
 
     @cached_property
     def _yield(self) -> PointEvaluator:
-        felt = self._felt()
-        response, parameters = self._response(felt), self.seen.parameters
+        felt = self._point_kinematics()
+        response, parameters = self._response(felt), self.geometry.parameters
         traction = ufl.variable(response.traction)
         functions = self.law.yield_functions(felt, traction, response.friction_bound, parameters)
         rows = {f"gradient {j}": ufl.diff(g, traction) for j, g in enumerate(functions)}
@@ -228,22 +234,22 @@ class PointLaw:
     @cached_property
     def _bound(self) -> tuple[bool, bool]:
         """What the expression of the friction bound says of itself; see the properties."""
-        felt = self._felt()
+        felt = self._point_kinematics()
         names = ["gap", "tangential_displacement", "tangential_increment", "multiplier"]
         given = {name: getattr(felt, name) for name in names}
         motion = {n: ufl.variable(v) for n, v in given.items() if v is not None}
-        pressure = ufl.variable(self.seen.gap)  # any scalar
-        bound = self.law.friction_bound(replace(felt, **motion), pressure, self.seen.parameters)
+        pressure = ufl.variable(self.geometry.gap)  # any scalar
+        bound = self.law.friction_bound(replace(felt, **motion), pressure, self.geometry.parameters)
         if any(_depends(bound, variable) for variable in motion.values()):
             return True, False
         return False, not _depends(ufl.diff(bound, pressure), pressure)
 
     @cached_property
     def _all(self) -> PointEvaluator:
-        law, parameters, felt = self.law, self.seen.parameters, self._felt()
+        law, parameters, felt = self.law, self.geometry.parameters, self._point_kinematics()
         response = self._response(felt)
         told = {
-            "normal_displacement": self.seen.gap - felt.gap,
+            "normal_displacement": self.geometry.gap - felt.gap,
             "opening": self._there(positive_part(felt.gap)),
             "penetration": self._there(positive_part(-felt.gap)),
             "normal_traction": response.normal_traction,
@@ -295,7 +301,7 @@ class PointLaw:
 
     def _own_normal(self, felt: PointKinematics, response: ContactTraction) -> dict[str, Any]:
         """What is known of r_n that does not follow from k_n (UFL): stiffness, and another way."""
-        law, parameters = self.law, self.seen.parameters
+        law, parameters = self.law, self.geometry.parameters
         gap = ufl.variable(felt.gap)
         at_variable = replace(felt, gap=gap)
         # Where nothing acts the stiffness is that of a point that has just closed.

@@ -10,6 +10,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
+from fenics_contact.contact.contact_kinematics import ContactKinematics, ContactParts
 from fenics_contact.contact.deformed import DeformedPlaces, VaryingMotion
 from fenics_contact.contact.finite import (
     ExactView,
@@ -24,7 +25,6 @@ from fenics_contact.contact.finite import (
 )
 from fenics_contact.contact.inputs import varies
 from fenics_contact.contact.obstacle_sampler import ObstacleSampler
-from fenics_contact.contact.opposite import Opposite, Parts
 from fenics_contact.contact.point_law import PointLaw, PointTangent
 from fenics_contact.contact.sampled import SampledPlaces
 from fenics_contact.contact.values import PointValues
@@ -32,17 +32,17 @@ from fenics_contact.obstacles.base import Placement, SampledObstacle
 from fenics_contact.surface.surface import PointEvaluator
 from fenics_contact.types import Array
 
-__all__ = ["MovingOpposite", "RigidOpposite"]
+__all__ = ["RigidFinite", "RigidSmall"]
 
 
-class RigidOpposite(Opposite):
-    """A rigid obstacle, seen from the undeformed Γc.
+class RigidSmall(ContactKinematics):
+    """A rigid obstacle, geometry from the undeformed Γc.
 
     Raises:
         ValueError: Data of a `SampledObstacle` do not fit.
     """
 
-    def __init__(self, parts: Parts) -> None:
+    def __init__(self, parts: ContactParts) -> None:
         x, jump = ufl.SpatialCoordinate(parts.quadrature.surface.mesh), parts.new_jump()
         shift = parts.inputs.shift
         frame = moved = Frame(shift, None)
@@ -70,11 +70,11 @@ class RigidOpposite(Opposite):
 
     @property
     def is_flat(self) -> bool:
-        """See `Opposite`."""
+        """See `ContactKinematics`."""
         return self._parts.obstacle.is_flat and self._varying is None
 
     def gradient_error(self, values: PointValues) -> Array:
-        """See `Opposite`."""
+        """See `ContactKinematics`."""
         if self.sampler is not None:
             place = values.x + values.jump - self.pairs.own_displacement()
             return self.sampler.gradient_error(place)
@@ -83,7 +83,7 @@ class RigidOpposite(Opposite):
         return np.asarray(np.linalg.norm(self._gradient_error()["error"], axis=1))
 
     def true_placement(self, values: PointValues) -> tuple[Array, Array]:
-        """See `Opposite`."""
+        """See `ContactKinematics`."""
         self.update()
         if self._varying is not None:
             data = self.data.values
@@ -97,8 +97,8 @@ class RigidOpposite(Opposite):
         return found if self._varying is None else self._varying.turn(*found)
 
 
-class MovingOpposite(Opposite):
-    """A rigid obstacle that may move and turn by any amount, seen from where Γc is now.
+class RigidFinite(ContactKinematics):
+    """A rigid obstacle that may move and turn by any amount, geometry from where Γc is now.
 
     Raises:
         ValueError: Its place is not known everywhere, or it is not rigid.
@@ -106,7 +106,7 @@ class MovingOpposite(Opposite):
 
     is_finite = True
 
-    def __init__(self, parts: Parts) -> None:
+    def __init__(self, parts: ContactParts) -> None:
         inputs, quadrature = parts.inputs, parts.quadrature
         mesh = quadrature.surface.mesh
         frame, jump = Frame(inputs.shift, inputs.rotation), parts.new_jump()
@@ -132,24 +132,27 @@ class MovingOpposite(Opposite):
         self.sampler = _sampler(parts)
 
     def update(self) -> None:
-        """See `Opposite`."""
+        """See `ContactKinematics`."""
         super().update()
         if self._moved is not None:
             self._moved.update()
         self._view.update()
 
-    def told(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
-        """See `Opposite`."""
+    def outputs(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
+        """See `ContactKinematics`."""
         view, normal, jump = self._view, self._view.values("normal"), self._view.values("relative")
         told = {"normal": normal, "jump": jump}
         if not self._parts.law.has_friction:
             return told
         told |= self._framed(arrays, normal)
         way = view.turned(view.values("gap")[:, None] * normal, back=True)
-        return told | {"foot": jump + way, "carried_traction": view.values("committed traction")}
+        return told | {
+            "projection_point": jump + way,
+            "carried_traction": view.values("committed traction"),
+        }
 
     def tangent(self, law: PointLaw) -> PointTangent:
-        """See `Opposite`."""
+        """See `ContactKinematics`."""
         tangent = super().tangent(law)
         rotation = self._parts.obstacle.rotation
         if self._parts.inputs.free_angle is None or rotation is None:
@@ -157,23 +160,23 @@ class MovingOpposite(Opposite):
         return replace(tangent, spun=rotation.rate(law.evaluate_traction()))
 
     def true_placement(self, values: PointValues) -> tuple[Array, Array]:
-        """See `Opposite`."""
+        """See `ContactKinematics`."""
         self.update()
         return self._view.values("gap"), self._view.values("normal")
 
     def turned(self, vectors: Array, *, back: bool = False) -> Array:
-        """See `Opposite`: of the frame of the obstacle."""
+        """See `ContactKinematics`: of the frame of the obstacle."""
         return self._view.turned(vectors, back=back)
 
     def gradient_error(self, values: PointValues) -> Array:
-        """See `Opposite`."""
+        """See `ContactKinematics`."""
         if self._moved is not None and self.sampler is not None:
             return self.sampler.gradient_error(self._moved.values("place"))
         error = self._view.values("slope") + self._view.values("normal")
         return np.asarray(np.linalg.norm(error, axis=1))
 
     def largest_curvature(self) -> Array:
-        """See `Opposite`."""
+        """See `ContactKinematics`."""
         turns = [self._view.values(f"turn {i}") for i in range(self._gdim)]
         by_place = -np.stack(turns, axis=1)
         curvature = (by_place + by_place.swapaxes(1, 2)) / 2
@@ -182,25 +185,25 @@ class MovingOpposite(Opposite):
         largest[known] = np.linalg.eigvalsh(curvature[known]).max(axis=1, initial=0.0)
         return largest
 
-    def feet(self, values: PointValues) -> dict[str, Array]:
-        """See `Opposite`."""
-        return {"jump": values.foot, "normal": values.framed_normal}
+    def projection_points(self, values: PointValues) -> dict[str, Array]:
+        """See `ContactKinematics`."""
+        return {"jump": values.projection_point, "normal": values.framed_normal}
 
     def start(self) -> dict[str, Array]:
-        """See `Opposite`: the foot, minus X, and the normal there."""
+        """See `ContactKinematics`: the projection_point, minus X, and the normal there."""
         self.update_data()
         assert self.sampler is not None
         gap, normal = self.sampler.sample(self.data.values["x"] + self.committed_jump)
         return {"jump": self.committed_jump + gap[:, None] * normal, "normal": normal}
 
 
-def _in_frame(parts: Parts, z: Any) -> Placement:
-    """Where a rigid obstacle is, seen from a place in its frame (UFL)."""
+def _in_frame(parts: ContactParts, z: Any) -> Placement:
+    """Where a rigid obstacle is, geometry from a place in its frame (UFL)."""
     return parts.obstacle.placed(z, lambda v: parts.inputs.to_ufl("obstacle", v))
 
 
-def _placed(parts: Parts, x: Any, frame: Frame) -> Placement:
-    """Where a displaced rigid obstacle is, seen from x (UFL)."""
+def _placed(parts: ContactParts, x: Any, frame: Frame) -> Placement:
+    """Where a displaced rigid obstacle is, geometry from x (UFL)."""
     placement = _in_frame(parts, frame.into(x))
     if frame.shift is None or _depends_on_place(parts):
         return placement
@@ -208,12 +211,12 @@ def _placed(parts: Parts, x: Any, frame: Frame) -> Placement:
     return replace(placement, gap=placement.gap + ufl.dot(frame.shift, placement.normal))
 
 
-def _depends_on_place(parts: Parts) -> bool:
+def _depends_on_place(parts: ContactParts) -> bool:
     """Whether the gap is a function of the place; else it is one on Γc."""
     return depends_on_place(lambda z: _in_frame(parts, z), parts.quadrature.surface.mesh)
 
 
-def _sampler(parts: Parts) -> ObstacleSampler | None:
+def _sampler(parts: ContactParts) -> ObstacleSampler | None:
     """What evaluates the obstacle anywhere; None where gap or normal are given on Γc alone."""
     obstacle = parts.obstacle
     if isinstance(obstacle, SampledObstacle):
@@ -225,7 +228,7 @@ def _sampler(parts: Parts) -> ObstacleSampler | None:
 
 
 def _sampled_places(
-    parts: Parts, jump: fem.Function, frame: Frame, moved: Frame
+    parts: ContactParts, jump: fem.Function, frame: Frame, moved: Frame
 ) -> tuple[SampledPlaces | None, SampledPlaces | None]:
     """An obstacle known in numbers, from X and from X + u in its frames; else none. Collective.
 

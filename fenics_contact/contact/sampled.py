@@ -24,7 +24,7 @@ class SampledPlaces:
     places have changed. The constructor is collective; `update` samples.
 
     Args:
-        place: Where the points are, seen from the obstacle, (gdim,) (UFL, length).
+        place: Where the points are, geometry from the obstacle, (gdim,) (UFL, length).
     """
 
     def __init__(

@@ -8,9 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fenics_contact.contact.acting import ActingLaw
+from fenics_contact.contact.contact_kinematics import (
+    ContactKinematics,
+    ContactParts,
+    KinematicsState,
+)
+from fenics_contact.contact.effective_law import EffectiveLaw
 from fenics_contact.contact.multipliers import Multipliers
-from fenics_contact.contact.opposite import Opposite, OppositeState, Parts
 from fenics_contact.contact.values import PointValues
 from fenics_contact.types import Array, Mask
 
@@ -31,7 +35,7 @@ class ContactState:
     """
 
     history: Array
-    opposite: OppositeState
+    kinematics: KinematicsState
     points: PointValues | None = None
     commits: int = 0
 
@@ -52,7 +56,7 @@ class ContactTrial:
     points: PointValues
     history: Mapping[str, Array]
     reference: Array
-    opposite: OppositeState
+    kinematics: KinematicsState
 
 
 class ContactStates:
@@ -67,16 +71,16 @@ class ContactStates:
 
     def __init__(
         self,
-        parts: Parts,
+        parts: ContactParts,
         multipliers: Multipliers | None,
-        opposite: Opposite,
-        acting: ActingLaw,
+        opposite: ContactKinematics,
+        acting: EffectiveLaw,
     ) -> None:
         self.history = history = parts.history
         self._name, self._law, self._multipliers = parts.name, parts.law, multipliers
-        self._opposite, self._acting = opposite, acting
+        self._opposite, self._effective_law = opposite, acting
         self._values: PointValues | None = None
-        opposite.begins_anew()
+        opposite.reset_reference()
         self.committed = ContactState(history.rows(), opposite.state())
         self._start()
 
@@ -98,8 +102,8 @@ class ContactStates:
     def evaluate_present(self) -> PointValues:
         """Evaluate them without a change of `values`. Collective."""
         self._opposite.update()
-        arrays = {**self._opposite.data.values, **self._acting.own.evaluate()}
-        return PointValues.of(arrays | self._opposite.told(arrays))
+        arrays = {**self._opposite.data.values, **self._effective_law.own.evaluate()}
+        return PointValues.of(arrays | self._opposite.outputs(arrays))
 
     def forget(self) -> None:
         """Discard the last evaluation: the next access to a result evaluates the present ``u``."""
@@ -111,7 +115,7 @@ class ContactStates:
         The obstacle is taken in its initial position. The constructor does so with the ``u`` at
         construction, and `ContactProblem` again before its first increment.
         """
-        if not self.committed.commits and self._opposite.begins_anew():
+        if not self.committed.commits and self._opposite.reset_reference():
             self._start()
 
     def _start(self) -> None:
@@ -121,7 +125,7 @@ class ContactStates:
             self.history.assign(start | self._opposite.start())
         self.set_state(ContactState(self.history.rows(), self._opposite.state()))
 
-    def begin_between(self, opposite: OppositeState) -> None:
+    def begin_between(self, opposite: KinematicsState) -> None:
         """Count an increment from its start between other pairs; `restore` undoes it. Collective.
 
         Args:
@@ -134,7 +138,7 @@ class ContactStates:
             self.history.assign(kept | {"jump": kept["jump"] + moved})
         self.forget()
 
-    def count_slip_from_here(self, points: Mask) -> None:
+    def set_slip_reference(self, points: Mask) -> None:
         """Measure slip from the state evaluated last where points were unloaded. Collective.
 
         `restore` undoes it.
@@ -147,8 +151,8 @@ class ContactStates:
             return
         points = points & (self.history.values("normal_traction") == 0.0)
         kept = {name: self.history.values(name) for name in self.history.names}
-        feet = self._opposite.feet(self.values)
-        counted = {n: np.where(points[:, None], v, kept[n]) for n, v in feet.items()}
+        projection_points = self._opposite.projection_points(self.values)
+        counted = {n: np.where(points[:, None], v, kept[n]) for n, v in projection_points.items()}
         self.history.assign(kept | counted)
         self.forget()
 
@@ -166,7 +170,7 @@ class ContactStates:
         if self._law.has_friction:
             values |= {
                 "traction": points.framed_traction,
-                "jump": points.foot,
+                "jump": points.projection_point,
                 "normal": points.framed_normal,
                 "slip": self.history.values("slip") + points.slip_increment,
             }
@@ -190,7 +194,7 @@ class ContactStates:
         if moved is not None and self._law.has_friction:
             history["jump"] = history["jump"] + moved
         rows, commits = self.history.packed(history), self.committed.commits + 1
-        before, opposite = self.committed.opposite.pairs.found_at, self._opposite.state()
+        before, opposite = self.committed.kinematics.pairs.found_at, self._opposite.state()
         self.set_state(ContactState(rows, opposite, trial.points, commits))
         replaced = before is None and opposite.pairs.found_at is not None
         comm = self.history.function.function_space.mesh.comm
@@ -217,7 +221,7 @@ class ContactStates:
         self.history.set_rows(self.committed.history if trial is None else trial.reference)
         if self._multipliers is not None:
             self._multipliers.restore(self.history)
-        self._opposite.set_state((trial or self.committed).opposite)
+        self._opposite.set_state((trial or self.committed).kinematics)
         self._values = (trial or self.committed).points
 
     def load_restart(self, history: Array, values: Mapping[str, Array], *, anew: bool) -> None:

@@ -122,8 +122,9 @@ class PointValues:
         slip_increment: Δβ of every mode, (n_points, n_modes) (length).
         multiplier: λ_n (stress).
         elastic_slip: What multipliers leave of K_t⁻¹ τ (length), as the history has it.
-        foot: Displacement of what the history measures slip by, in the frame of the obstacle
-            (length): the jump, or with finite kinematics that of the closest point of the obstacle.
+        projection_point: Displacement of what the history measures slip by, in the frame of the
+            obstacle (length): the jump, or with finite kinematics that of the closest point of the
+            obstacle.
         framed_traction, framed_normal: τ (stress) and n in the frame of the obstacle.
         carried_traction: The committed τ as obstacle and normal have turned it since (stress).
         arrays: All that was evaluated, by name, for files.
@@ -159,7 +160,7 @@ class PointValues:
     slip_increment: Array
     multiplier: Array
     elastic_slip: Array
-    foot: Array
+    projection_point: Array
     framed_traction: Array
     framed_normal: Array
     carried_traction: Array
@@ -187,7 +188,11 @@ class PointValues:
         found["slip_increment"] = np.broadcast_to(0.0, (n, 0))
         found |= {f.name: arrays[f.name] for f in fields(cls) if f.name in arrays}
         # With small displacements the history is in space.
-        kept = {"foot": "jump", "framed_traction": "traction", "framed_normal": "normal"}
+        kept = {
+            "projection_point": "jump",
+            "framed_traction": "traction",
+            "framed_normal": "normal",
+        }
         kept |= {"carried_traction": "old_traction"}
         found |= {name: found[other] for name, other in kept.items() if name not in arrays}
         return cls(**found | {"parameters": parameters, "arrays": arrays})

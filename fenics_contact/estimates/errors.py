@@ -21,7 +21,7 @@ from fenics_contact.compiling import compile_form
 from fenics_contact.contact.choices import is_regularised
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
-from fenics_contact.markup import shown
+from fenics_contact.markup import html_table
 from fenics_contact.parallel import global_max, global_sum, longest
 from fenics_contact.problem import ContactProblem
 from fenics_contact.surface.displacement import Displacement
@@ -138,7 +138,7 @@ class ErrorBudget:
         total = self.total
         together = ("together", *(f"{100 * total[name]:.2g}" for name in self.values))
         header = ("error in %", *self.values)
-        return shown("Error budget", header, [*self._rows(), together], self._remarks())
+        return html_table("Error budget", header, [*self._rows(), together], self._remarks())
 
     def _rows(self) -> list[tuple[str, ...]]:
         """Every part with its errors in per cent."""

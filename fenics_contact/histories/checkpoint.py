@@ -17,9 +17,9 @@ import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 
-from fenics_contact.histories.archive import (
+from fenics_contact.histories.checkpoint_file import (
     FORMAT,
-    Stored,
+    StoredCheckpoint,
     check_finite,
     read_file,
     refuse,
@@ -33,7 +33,7 @@ from fenics_contact.histories.fingerprint import (
     probe,
     why_another_scene,
 )
-from fenics_contact.histories.places import (
+from fenics_contact.histories.point_matching import (
     find,
     gather,
     layout_of,
@@ -46,12 +46,12 @@ from fenics_contact.histories.places import (
     set_rows,
     unpack,
 )
-from fenics_contact.parallel import collective_errors, fail_together
+from fenics_contact.parallel import collective_errors, raise_collectively
 from fenics_contact.problem import ContactProblem
 from fenics_contact.types import Array
 
 __all__ = [
-    "Stored",
+    "StoredCheckpoint",
     "check_fields",
     "check_mismatch",
     "check_places",
@@ -107,7 +107,7 @@ def save(
     check_fields(problem, state_fields)
     check_places(problem)
     rows = _in_units(problem, problem.committed_rows())
-    anew = [contact.opposite.pairs_anew for contact in problem.contacts]
+    anew = [contact.contact_kinematics.updates_pairs for contact in problem.contacts]
     arrays = {
         "numbers": np.array(numbers, dtype=np.float64),
         "state": np.array([problem.increment, problem.expected_increments, *anew], np.float64),
@@ -241,7 +241,7 @@ def check_places(problem: ContactProblem) -> None:
     _told_apart.add(problem)
 
 
-def read(problem: ContactProblem, path: str | Path) -> Stored:
+def read(problem: ContactProblem, path: str | Path) -> StoredCheckpoint:
     """Read a checkpoint file and check its integrity. Collective.
 
     Raises:
@@ -254,12 +254,12 @@ def read(problem: ContactProblem, path: str | Path) -> Stored:
         if comm.rank == 0:
             found = read_file(path)
     scene, arrays = comm.bcast(found)
-    return Stored(path, scene, arrays)
+    return StoredCheckpoint(path, scene, arrays)
 
 
 def take_up(
     problem: ContactProblem,
-    stored: Stored,
+    stored: StoredCheckpoint,
     *,
     loads: Callable[[], None] | None = None,
     state_fields: Sequence[fem.Function] = (),
@@ -322,7 +322,7 @@ def take_up(
                 ', or give on_mismatch="continue" to continue with the present data',
             )
     except BaseException as error:
-        fail_together(comm, error)
+        raise_collectively(comm, error)
         for field, array in zip(state_fields, before, strict=True):
             field.x.array[:] = array
         raise

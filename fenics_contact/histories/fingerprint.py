@@ -14,8 +14,8 @@ from mpi4py import MPI
 
 from fenics_contact import compat
 from fenics_contact.contact.contact import Contact
-from fenics_contact.histories.archive import Stored
-from fenics_contact.histories.places import parts_of, positions
+from fenics_contact.histories.checkpoint_file import StoredCheckpoint
+from fenics_contact.histories.point_matching import parts_of, positions
 from fenics_contact.histories.signature import signature_of_law, signature_of_obstacle
 from fenics_contact.obstacles.base import SampledObstacle
 from fenics_contact.obstacles.deformable import DeformableBody
@@ -32,7 +32,7 @@ _LENGTHS = ("initial_gap", "shift", "about")
 
 
 def why_another_scene(
-    stored: Stored, problem: ContactProblem, fields: Sequence[fem.Function]
+    stored: StoredCheckpoint, problem: ContactProblem, fields: Sequence[fem.Function]
 ) -> list[str]:
     """Why no state of a file can be one of this problem, in words; empty: it may. Collective."""
     words = _compare_words(stored.scene["fixed"], fixed_words(problem, fields))
@@ -40,7 +40,7 @@ def why_another_scene(
 
 
 def changed_data(
-    stored: Stored,
+    stored: StoredCheckpoint,
     problem: ContactProblem,
     committed: Array,
     given: Sequence[dict[str, Array]],
@@ -179,7 +179,7 @@ def _compare_words(theirs: dict[str, str], ours: dict[str, str]) -> list[str]:
 
 
 def _compare_shapes(
-    stored: Stored, problem: ContactProblem, fields: Sequence[fem.Function]
+    stored: StoredCheckpoint, problem: ContactProblem, fields: Sequence[fem.Function]
 ) -> list[str]:
     """Whether the arrays are those of such a problem, but for the numbers of places."""
     gdim, n_motions = len(problem.displacement.u), problem.full.unknowns.n_motions
@@ -253,11 +253,11 @@ def data_of(contact: Contact) -> dict[str, Array]:
     The results of the last evaluation are not changed.
     """
     contact.inputs.update()
-    contact.opposite.update_data()
-    data = contact.opposite.data.values
+    contact.contact_kinematics.update_data()
+    data = contact.contact_kinematics.data.values
     names = ["weight", "normal", "shift", "turn", "about", "axis"]
     # Else it is that of the latest pairs.
-    if contact.gap_prescribed or not contact.opposite.may_pair_anew:
+    if contact.gap_prescribed or not contact.contact_kinematics.can_update_pairs:
         names.append("initial_gap")
     return {n: v for n, v in data.items() if n in names or n.startswith("parameter ")}
 

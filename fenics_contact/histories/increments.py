@@ -18,7 +18,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.estimates.errors import quantities
 from fenics_contact.failure import NotConverged
 from fenics_contact.histories import checkpoint as states
-from fenics_contact.histories.progress import Bar
+from fenics_contact.histories.progress import ProgressBar
 from fenics_contact.histories.table import Table
 from fenics_contact.methods.attempt import Attempt
 from fenics_contact.obstacles.base import SampledObstacle
@@ -168,7 +168,7 @@ def increments(
     bar = None
     with collective_errors(comm):
         if progress and comm.rank == 0:
-            bar = Bar(progress if isinstance(progress, str) else "", start, end)
+            bar = ProgressBar(progress if isinstance(progress, str) else "", start, end)
 
     def apply(value: float) -> None:
         with collective_errors(comm):
@@ -185,7 +185,7 @@ def increments(
         )
     if csv is not None:
         table = Table(Path(csv), problem, tuple(quantities(problem)) if estimate else ())
-    leg = _Leg(float(start), ends, float(start), estimate)
+    leg = _LoadSegment(float(start), ends, float(start), estimate)
     every = max_cuts, checkpoint_every, recover_interior
     made = _history(problem, apply, leg, file, every, list(state_fields), on_mismatch, table)
     return _Started(made, comm, bar)
@@ -218,7 +218,11 @@ def _contact_reads(contact: Contact, constant: fem.Constant) -> bool:
     """
     seen = is_built_in(contact.law) and not isinstance(contact.obstacle, SampledObstacle)
     loads = [motion.load() for motion in contact.motions]
-    return not seen or contact.opposite.data.reads(constant) or any(f is constant for f in loads)
+    return (
+        not seen
+        or contact.contact_kinematics.data.reads(constant)
+        or any(f is constant for f in loads)
+    )
 
 
 def _check_constant(problem: ContactProblem, load: fem.Constant, start: float, end: float) -> None:
@@ -242,7 +246,9 @@ def _check_constant(problem: ContactProblem, load: fem.Constant, start: float, e
 class _Started(Iterator[Step]):
     """Increments that are solved as they are asked for; warns if none ever is."""
 
-    def __init__(self, steps: Generator[Step, None, None], comm: MPI.Comm, bar: Bar | None) -> None:
+    def __init__(
+        self, steps: Generator[Step, None, None], comm: MPI.Comm, bar: ProgressBar | None
+    ) -> None:
         self._steps, self._comm, self._asked, self._bar = steps, comm, False, bar
 
     def __next__(self) -> Step:
@@ -277,7 +283,7 @@ class _Started(Iterator[Step]):
 def _history(
     problem: ContactProblem,
     apply: Callable[[float], None],
-    leg: _Leg,
+    leg: _LoadSegment,
     checkpoint: Path | None,
     every: tuple[int, int, str | int],
     fields: Sequence[fem.Function],
@@ -290,7 +296,7 @@ def _history(
     end = ends[-1]
     at = _Progress(start)
     error = dict.fromkeys(quantities(problem), 0.0) if estimate else {}
-    calls, stored = _Calls([leg], True), None
+    calls, stored = _LoadProgramme([leg], True), None
     if checkpoint is not None:
         calls, stored = _place(problem, checkpoint, leg)
     if not calls.begun:
@@ -412,7 +418,7 @@ def _history(
 
 
 @dataclasses.dataclass
-class _Leg:
+class _LoadSegment:
     """What one call of `increments` asks for.
 
     Attributes:
@@ -441,7 +447,7 @@ class _Leg:
     def is_done(self) -> bool:
         return self.passed() == len(self.ends)
 
-    def same(self, other: _Leg, *, up_to: float | None = None) -> bool:
+    def same(self, other: _LoadSegment, *, up_to: float | None = None) -> bool:
         """Whether another one asks for the same; if given, up to a load parameter."""
         n, m = len(self.ends), len(other.ends)
         if up_to is not None:
@@ -461,7 +467,7 @@ class _Leg:
 
 
 @dataclasses.dataclass
-class _Calls:
+class _LoadProgramme:
     """The calls of `increments` for a problem and a file.
 
     Attributes:
@@ -469,17 +475,17 @@ class _Calls:
         begun: Whether the problem has a state of this path; else all of them were done in the file.
     """
 
-    legs: list[_Leg]
+    legs: list[_LoadSegment]
     begun: bool
 
 
-_calls: weakref.WeakKeyDictionary[ContactProblem, dict[Path, _Calls]]
+_calls: weakref.WeakKeyDictionary[ContactProblem, dict[Path, _LoadProgramme]]
 _calls = weakref.WeakKeyDictionary()
 
 
 def _place(
-    problem: ContactProblem, checkpoint: Path, leg: _Leg
-) -> tuple[_Calls, states.Stored | None]:
+    problem: ContactProblem, checkpoint: Path, leg: _LoadSegment
+) -> tuple[_LoadProgramme, states.StoredCheckpoint | None]:
     """Where in the load path of a file a call stands. Collective.
 
     Returns:
@@ -489,21 +495,23 @@ def _place(
     Raises:
         ValueError: The file is of another path.
     """
-    known = _calls.setdefault(problem, {}).setdefault(checkpoint.absolute(), _Calls([], False))
+    known = _calls.setdefault(problem, {}).setdefault(
+        checkpoint.absolute(), _LoadProgramme([], False)
+    )
     legs = known.legs
     # A loop that was left, or an increment that failed: the same call goes on.
     again = known.begun and not legs[-1].is_done() and leg.same(legs[-1], up_to=legs[-1].reached)
     earlier = legs[:-1] if again else legs
     there = (again or not known.begun) and states.exists(problem, checkpoint)
     if not there and (known.begun or not legs):
-        return _Calls([*earlier, leg], True), None
+        return _LoadProgramme([*earlier, leg], True), None
     stored = states.read(problem, checkpoint) if there else None
     try:
-        theirs = [_Leg(**each) for each in stored.notes or ()] if stored else []
+        theirs = [_LoadSegment(**each) for each in stored.notes or ()] if stored else []
     except TypeError:  # notes of a caller of `checkpoint.save`
         theirs = []
     if again and len(theirs) <= len(earlier):  # nothing of it was saved
-        return _Calls([*earlier, leg], True), None
+        return _LoadProgramme([*earlier, leg], True), None
     if len(theirs) <= len(earlier):
         raise ValueError(
             f"{checkpoint} has {len(theirs)} calls of increments(), and this is number "
@@ -525,9 +533,9 @@ def _place(
         )
     leg.reached = there_leg.reached
     if is_last:
-        return _Calls([*earlier, leg], True), stored
+        return _LoadProgramme([*earlier, leg], True), stored
     known.legs.append(leg)
-    return _Calls([*earlier, leg], False), None
+    return _LoadProgramme([*earlier, leg], False), None
 
 
 class _Watch:

@@ -8,12 +8,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["Bar"]
+__all__ = ["ProgressBar"]
 
 logger = logging.getLogger("fenics_contact")
 
 
-class Bar(logging.Filter):
+class ProgressBar(logging.Filter):
     """A bar of tqdm that is there while increments are solved, and gone in between.
 
     So what a script prints of a step stands on lines of its own, and so do lines of the log, before

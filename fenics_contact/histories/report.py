@@ -21,7 +21,7 @@ from fenics_contact.estimates.errors import ErrorBudget
 from fenics_contact.histories import table
 from fenics_contact.installation import information
 from fenics_contact.laws.stiffness import NodalSprings, RelativeStiffness
-from fenics_contact.markup import shown
+from fenics_contact.markup import html_table
 from fenics_contact.parallel import collective_errors, global_max
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import drawing, files, plotting
@@ -153,7 +153,7 @@ def report(
         page.words("Versions", ("what", "version"), words)
         with collective_errors(comm):
             if comm.rank == 0:
-                with files.replacing(path) as temporary:
+                with files.atomic_write(path) as temporary:
                     temporary.write_text(page.text(title), encoding="utf-8")
     return path
 
@@ -251,7 +251,7 @@ class _Page:
 
     def words(self, title: str, header: Sequence[str], rows: Iterable[tuple[str, ...]]) -> None:
         """A table of words."""
-        self.add('<div class="words">', shown(title, header, rows), "</div>")
+        self.add('<div class="words">', html_table(title, header, rows), "</div>")
 
     def path(self) -> Path:
         """Where the next picture is to be drawn."""
@@ -397,7 +397,7 @@ def _contact(page: _Page, contact: Contact, step: Step, magnification: float) ->
     ]
     area = f"area [{page.length}²{page.per(contact.inputs.per_thickness)}]"
     header = ("state", area, f"from [{page.length}]", f"to [{page.length}]")
-    page.add(shown("Extents on the undeformed surface", header, rows))
+    page.add(html_table("Extents on the undeformed surface", header, rows))
 
 
 def _place(x: Array) -> str:

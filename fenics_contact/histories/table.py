@@ -93,7 +93,7 @@ class Table:
         with collective_errors(self._comm):
             if self._comm.rank == 0:
                 kept = self._rows() if self._problem.increment else []
-                with files.replacing(self._path) as path:
+                with files.atomic_write(self._path) as path:
                     path.write_bytes("".join([self._header, *kept]).encode())
 
     def _rows(self) -> list[str]:

@@ -18,7 +18,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact import compat
-from fenics_contact.parallel import fail_together
+from fenics_contact.parallel import raise_collectively
 from fenics_contact.systems import dense, linear
 from fenics_contact.types import Array
 
@@ -152,7 +152,7 @@ class Callbacks:
                     raise error
             finally:
                 del error  # it keeps this frame, which would keep it and all that solves
-        dense.raise_kept(snes.getKSP())
+        dense.raise_stored_error(snes.getKSP())
         reason, pc = snes.getConvergedReason(), snes.getKSP().getPC()
         refused = reason <= 0 and self._comm.allreduce(linear.refused_memory(pc))
         linear.forget_failure(pc)
@@ -191,6 +191,6 @@ class Callbacks:
                 release_interrupt()
                 return function(*arguments)
             except BaseException as error:
-                fail_together(self._comm, error)
+                raise_collectively(self._comm, error)
                 self._error = error
         return otherwise

@@ -15,7 +15,7 @@ import logging
 import numpy as np
 from petsc4py import PETSc
 
-from fenics_contact.methods.method import OwnMethod, Tools
+from fenics_contact.methods.method import SolverContext, StandaloneMethod
 
 __all__ = ["Continuation"]
 
@@ -37,7 +37,7 @@ _MAX_ITERATIONS = 1000
 _COARSE = 1e-3
 
 
-class Continuation(OwnMethod):
+class Continuation(StandaloneMethod):
     """The method.
 
     Attributes:
@@ -45,9 +45,9 @@ class Continuation(OwnMethod):
         by_newton: Whether there was a solution the last time.
     """
 
-    def __init__(self, tools: Tools) -> None:
-        self._equations = tools.equations
-        self._newton = tools.newton("continuation_", {"snes_max_it": _PATIENCE})
+    def __init__(self, context: SolverContext) -> None:
+        self._equations = context.equations
+        self._newton = context.newton("continuation_", {"snes_max_it": _PATIENCE})
         self._newton.most_halvings = _HALVINGS
         self.snes = self._newton.snes
         self.by_newton = False
@@ -59,7 +59,7 @@ class Continuation(OwnMethod):
         self._newton.attach(consistent=True)
         self._whole = [float(c.inputs.stiffness_factor.value) for c in equations.contacts]
         # Softer than it is in any case: Newton's method alone is what failed.
-        soft = 1.0 / max(equations.hardness(), _FACTOR)
+        soft = 1.0 / max(equations.stiffness_ratio(), _FACTOR)
         # From a start as near as they are solved to, softer problems only lead away.
         equations.residual(equations.solution, equations.function)
         near = equations.solved(_COARSE)
@@ -68,7 +68,7 @@ class Continuation(OwnMethod):
         try:
             while iterations <= _MAX_ITERATIONS:
                 self._soften(share)
-                equations.watch.start()
+                equations.monitor.start()
                 made, reason = self._newton.solve()
                 iterations += made
                 self.by_newton = reason > 0

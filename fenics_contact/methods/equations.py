@@ -14,7 +14,7 @@ from petsc4py import PETSc
 from fenics_contact.contact.values import Status
 from fenics_contact.methods.active_set_monitor import ActiveSetMonitor
 from fenics_contact.methods.limit_analysis import Overload, find_overload
-from fenics_contact.methods.regularisation import LooseModes
+from fenics_contact.methods.regularisation import UnconstrainedModes
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.systems.balance import InitialForces, Norms
 from fenics_contact.systems.ejected_bodies import find_ejected_bodies
@@ -78,7 +78,7 @@ class Equations:
         self.length = full.scales.mesh_size
         self._bulk, self._comm = full.bulk, full.unknowns.comm
         self._alpha, self._phi = alpha, phi
-        self.watch = ActiveSetMonitor(full.contacts)
+        self.monitor = ActiveSetMonitor(full.contacts)
         nothing: Array = np.zeros(full.n_bodies)
         self.norms = Norms(nothing, nothing, nothing, nothing, nothing.size)
         self.start = InitialForces(nothing, np.zeros((len(full.contacts), full.n_bodies)))
@@ -93,7 +93,7 @@ class Equations:
         self.filled: set[bool] = set()
         self.h0_is_made = False
         self.system: System = full
-        self.began = full.state()
+        self.initial_unknowns = full.state()
         self.has_round_off = False
         self.solution, self.function = full.vector(), full.vector()
 
@@ -123,7 +123,7 @@ class Equations:
         system = self.system
         # Newton's method would end there: nothing acts on such a body.
         ejected = system is self.full and find_ejected_bodies(
-            self.full, self.motions, contacts, self.began, self.start
+            self.full, self.motions, contacts, self.initial_unknowns, self.start
         )
         if ejected or self._bulk.is_inverted() or system.is_twisted() or system.is_degenerate():
             total[:] = np.nan  # a line search takes a shorter step
@@ -171,7 +171,7 @@ class Equations:
     @property
     def has_potential(self) -> bool:
         """Whether every contact law has one."""
-        return all(c.acting.has_potential for c in self.contacts)
+        return all(c.effective_law.has_potential for c in self.contacts)
 
     def symmetric(self, consistent: bool) -> bool:
         """Whether the matrix of H₀, or of the consistent tangent, is."""
@@ -244,7 +244,7 @@ class Equations:
 
     def note(self) -> None:
         """Let `watch` see the status of the points, evaluated where `norms` are from."""
-        self.watch.note(self.norms.total)
+        self.monitor.note(self.norms.total)
 
     def is_constrained(self) -> bool:
         """Whether the closed points hold all free motions. Collective."""
@@ -256,12 +256,12 @@ class Equations:
         Slipping points of the bodies concerned get the secant stiffness of friction under the
         present pressure, with which a step along the mode goes as far as they have slipped, by the
         share of the forces on the mode that is not in balance. Open points get the stiffness with
-        which it closes the nearest gap (`LooseModes.closing`), where slipping points would not hold
-        the body if they stuck; those at which friction acts all the same, as one whose bound does
-        not depend on pressure does, count as slipping points along Γc. With what is not in balance
+        which it closes the nearest gap (`UnconstrainedModes.closing`), where slipping points would
+        not hold the body if they stuck. Open points at which friction acts all the same (a bound that
+        does not depend on the pressure) count as slipping points along Γc. With what is not in balance
         the regularisation vanishes, and convergence stays superlinear (Levenberg-Marquardt).
         """
-        full, modes = self.full, self._loose_modes()
+        full, modes = self.full, self._unconstrained_modes()
         if modes is None or np.isnan(modes.share).all():
             self.regularised_modes = np.zeros((0, 0))
             yield from self.tangents()
@@ -278,22 +278,22 @@ class Equations:
             slips = np.where(values.slips, share[group], 0.0)
             opens = np.where(close < 1.0, close, share[group])
             opens[closed | ~modes.is_open[group]] = 0.0
-            tangent = contact.acting.tangent().scaled(1.0 - slips)
+            tangent = contact.effective_law.tangent().scaled(1.0 - slips)
             yield operator.tangent(tangent)
             normal = opens + np.where(closed, slips, 0.0)
             tangential = np.where(values.friction_bound > 0, 0.0, opens)
             tangential += slips * values.friction_secant
             yield operator.springs(values.springs(normal, tangential))
 
-    def _loose_modes(self) -> LooseModes | None:
+    def _unconstrained_modes(self) -> UnconstrainedModes | None:
         """Rigid-body modes that contact leaves free at the evaluated state. Collective."""
         full, motions = self.full, self.motions
         if not len(motions.free):
             return None
         # Of a body that was positioned round-off closes some of many points.
         idle = full.contact_force_sizes() < _OPEN_SHARE * self.loads
-        first = self.watch.tractions or [c.values.total_traction for c in self.contacts]
-        return LooseModes.find(motions, full.scales, full.operators, full.load, first, idle)
+        first = self.monitor.tractions or [c.values.total_traction for c in self.contacts]
+        return UnconstrainedModes.find(motions, full.scales, full.operators, full.load, first, idle)
 
     def tangents(self) -> Iterator[PETSc.Mat]:
         """Consistent tangents of the contacts, which are evaluated. Collective."""
@@ -315,7 +315,7 @@ class Equations:
             springs = contact.values.springs(self._alpha * normal, self._phi * tangential)
             yield operator.springs(springs)
 
-    def hardness(self) -> float:
+    def stiffness_ratio(self) -> float:
         """Largest ratio of contact's stiffness to the bulk's at an unknown. Collective."""
         bulk = self.system.bulk_diagonal()
         added = np.zeros_like(bulk)

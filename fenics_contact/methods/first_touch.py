@@ -17,13 +17,13 @@ from fenics_contact.parallel import global_max, global_min
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.types import Array, Mask
 
-__all__ = ["count_slip_from_touch"]
+__all__ = ["set_slip_reference_at_touch"]
 
 # First touch is found where the least gap is below this share of the one at the start.
 _TOUCHING_GAP_RATIO = 1e-6
 
 
-def count_slip_from_touch(
+def set_slip_reference_at_touch(
     full: FullSystem,
     start: Array,
     end_without: Callable[[Sequence[tuple[Contact, Mask]], Array], Array | None],
@@ -49,7 +49,7 @@ def count_slip_from_touch(
         return None
     present = full.state()
     full.evaluate_at(start)
-    ways = [part.contact.opposite.committed_offset(part.contact.values) for part in parts]
+    ways = [part.contact.contact_kinematics.committed_offset(part.contact.values) for part in parts]
     apart = [(part, way) for part, way in zip(parts, ways, strict=True) if part.is_apart(comm, way)]
     full.set_state(present)
     end = end_without(_without([part for part, _ in apart]), start) if apart else None
@@ -62,7 +62,7 @@ def count_slip_from_touch(
             share = shares[groups == group].min()
             if share < 1.0:
                 path.gap(share)
-                path.part.contact.states.count_slip_from_here(path.part.points)
+                path.part.contact.states.set_slip_reference(path.part.points)
         expected = end if shares.min() == 1.0 else None
     full.evaluate_at(present)
     return expected
@@ -106,7 +106,7 @@ class _Part:
         Those of points without an opposite, and of other parts, are infinite.
         """
         contact = self.contact
-        with contact.opposite.displaced(way):
+        with contact.contact_kinematics.displaced(way):
             contact.evaluate()
         return np.where(contact.paired & self.points, contact.values.gap, np.inf)
 

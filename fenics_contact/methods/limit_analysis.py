@@ -16,7 +16,7 @@ import numpy as np
 import scipy.optimize
 from mpi4py import MPI
 
-from fenics_contact.parallel import agreed, global_max, global_sum
+from fenics_contact.parallel import broadcast_from_root, global_max, global_sum
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.tolerances import NEGLIGIBLE
@@ -113,7 +113,7 @@ def _worst_motion(
     contacts = [contact for contact, _ in coupled]
     rubbing = [c for c in contacts if c.law.has_friction]
     unlimited = any(c.law.has_tangential and not c.law.has_friction for c in contacts)
-    unlimited |= any(c.acting.own.bound_depends_on_motion for c in rubbing)
+    unlimited |= any(c.effective_law.own.bound_depends_on_motion for c in rubbing)
     if unlimited or not rubbing or any(c.finite or c.law.has_tension for c in contacts):
         return None
     finite = all(
@@ -171,7 +171,7 @@ def _worst_motion(
         made = scipy.optimize.linprog(
             -wanted / size, A_ub=planes, b_ub=bounds, bounds=(-_FAR, _FAR)
         )
-        status, motion = agreed(comm, (made.status, made.x))
+        status, motion = broadcast_from_root(comm, (made.status, made.x))
         if status != 0 or wanted @ motion / size <= max(1.0, most * (1 + _NEAR)):
             break
     if worst is None or most <= 1.0:

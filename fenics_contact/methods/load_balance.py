@@ -13,7 +13,7 @@ import scipy.optimize
 import scipy.sparse.csgraph
 
 from fenics_contact.contact.contact import Contact
-from fenics_contact.parallel import agreed, gather_rows
+from fenics_contact.parallel import broadcast_from_root, gather_rows
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
@@ -91,10 +91,10 @@ def check_balance(modes: RigidBodyModes, load: Array, operators: Sequence[Contac
         # of rounding only, such as of tangential forces on a mode across them, is none.
         length = np.linalg.norm(rays, axis=1)
         rays = rays[length > _FELT] / length[length > _FELT, None]
-        rest = agreed(comm, unbalanced(rays.T, direction)) if len(rays) else 1.0
+        rest = broadcast_from_root(comm, unbalanced(rays.T, direction)) if len(rays) else 1.0
         allowed = _BALANCED * max(1.0, size[group].max() / largest)
         if rest > allowed:
-            limits = agreed(comm, _largest_forces(rays.T, direction)) + 0.0  # no -0
+            limits = broadcast_from_root(comm, _largest_forces(rays.T, direction)) + 0.0  # no -0
             beyond += _describe(modes, rows[group], direction, limits, allowed, largest)
     if beyond:
         raise ValueError(

@@ -18,7 +18,7 @@ from fenics_contact.methods.options import Defaults
 from fenics_contact.systems import linear
 from fenics_contact.types import Array
 
-__all__ = ["Method", "Newton", "OwnMethod", "SnesMethod", "Tools"]
+__all__ = ["Method", "Newton", "SnesMethod", "SolverContext", "StandaloneMethod"]
 
 # Least decrease of the level function along a step. Without any, Newton's method cycled between two
 # states whose levels were 0.93 and 0.96 of each other's; with a quarter (Deuflhard's restricted
@@ -36,7 +36,7 @@ _REASONS = PETSc.SNES.ConvergedReason
 
 
 class Method(ABC):
-    """A way to solve equations from a start: on the main SNES, or an `OwnMethod`."""
+    """A way to solve equations from a start: on the main SNES, or an `StandaloneMethod`."""
 
     @classmethod
     def main_options(cls) -> Mapping[str, Any]:
@@ -53,7 +53,7 @@ class Method(ABC):
 
 
 @dataclass(frozen=True)
-class Tools:
+class SolverContext:
     """What methods with solvers of their own are made of, and do not keep: it leads to PETSc's.
 
     Attributes:
@@ -106,12 +106,13 @@ class Tools:
         return snes, bool(solver)
 
 
-class OwnMethod(Method):
+class StandaloneMethod(Method):
     """A method with solvers of its own; a new one is such a class, and a line in `METHODS`.
 
     `solve` starts from ``equations.solution`` and leaves there what it has found, with the data of
     the contacts as they were; it has converged where ``equations.solved()`` after an
-    ``equations.residual``. Newton's method of `Tools.newton` does both: `Newton.attach` it before
+    ``equations.residual``. Newton's method of `SolverContext.newton` does both: `Newton.attach` it
+    before
     every solution, and return what its ``solve`` returns. It gives up after 14 iterations without
     a lower residual (`ActiveSetMonitor.idle`), so that the methods that follow get their turn.
 
@@ -123,7 +124,7 @@ class OwnMethod(Method):
     by_newton = False
 
     @abstractmethod
-    def __init__(self, tools: Tools) -> None:
+    def __init__(self, context: SolverContext) -> None:
         """Set up what solves. Collective."""
 
     @property
@@ -212,7 +213,7 @@ class SnesMethod(Method):
         """Why SNES ends here, or that it goes on, as SNES has it."""
         if self._equations.solved(self.coarse):
             return int(_REASONS.CONVERGED_FNORM_RELATIVE)
-        if self._equations.watch.idle > _PATIENCE and self.gives_up():
+        if self._equations.monitor.idle > _PATIENCE and self.gives_up():
             return int(_REASONS.DIVERGED_LINE_SEARCH)
         return int(_REASONS.ITERATING)
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from fenics_contact.contact.body import NEGLIGIBLE_SLIDE
 from fenics_contact.contact.contact import Contact
-from fenics_contact.contact.opposite import OppositeState
+from fenics_contact.contact.contact_kinematics import KinematicsState
 from fenics_contact.parallel import global_sum
 from fenics_contact.state import State
 from fenics_contact.systems.full import FullSystem
@@ -55,7 +55,7 @@ class _Pairing:
     depth: Array
     share: float
     number: int
-    opposite: OppositeState | None = None
+    kinematics: KinematicsState | None = None
 
 
 class OppositePoints:
@@ -76,7 +76,7 @@ class OppositePoints:
         self.end: Array | None = None
         self.predicted = False
         self._full = full
-        self.contacts = [c for c in contacts if c.opposite.may_pair_anew]
+        self.contacts = [c for c in contacts if c.contact_kinematics.can_update_pairs]
         self._pairings: dict[str, _Pairing] = {}
 
     @property
@@ -104,10 +104,10 @@ class OppositePoints:
         self._full.set_state(end)
         for contact in self.contacts:
             before = contact.states.committed.points
-            if before is None or not contact.opposite.pairs_anew:
+            if before is None or not contact.contact_kinematics.updates_pairs:
                 continue
             contact.evaluate()
-            if contact.opposite.needs_new_pairs(contact.values, before):
+            if contact.contact_kinematics.needs_new_pairs(contact.values, before):
                 self._pairings[contact.name] = _Pairing(end, None, contact.values.depth, 1.0, 0)
         self.predicted = self.replaced
         self.find(state.unknowns)
@@ -150,11 +150,11 @@ class OppositePoints:
         return predicted
 
     def to_update(self) -> list[Contact]:
-        """Contacts that need new pairs, see `Opposite.needs_new_pairs`. Collective."""
+        """Contacts that need new pairs, see `ContactKinematics.needs_new_pairs`. Collective."""
         return [
             c
             for c in self.contacts
-            if self._number_of(c) < _MAX_PAIRINGS and c.opposite.needs_new_pairs(c.values)
+            if self._number_of(c) < _MAX_PAIRINGS and c.contact_kinematics.needs_new_pairs(c.values)
         ]
 
     def to_update_for(self, names: Sequence[str]) -> list[Contact]:
@@ -173,7 +173,7 @@ class OppositePoints:
             for c in self.contacts
             if (number := self._number_of(c)) < _MAX_PAIRINGS
             and (
-                c.opposite.largest_slide(c.values) > NEGLIGIBLE_SLIDE
+                c.contact_kinematics.largest_slide(c.values) > NEGLIGIBLE_SLIDE
                 or (c.name in names and number == 0)
             )
         ]
@@ -194,7 +194,7 @@ class OppositePoints:
         for contact in contacts:
             values, last = contact.values, self._pairings.get(contact.name)
             slide = values.slide / contact.quadrature.facet_sizes[:, None]
-            slide[~contact.opposite.transmitting_points(values)] = np.nan
+            slide[~contact.contact_kinematics.transmitting_points(values)] = np.nan
             share, state, number = 1.0, end, 1
             if last is not None:
                 number = last.number + 1
@@ -218,17 +218,19 @@ class OppositePoints:
         for contact in new:
             pairing = self._pairings[contact.name]
             self._full.set_state(pairing.state)
-            contact.opposite.find_pairs(contact.displacement.u, pairing.depth)
+            contact.contact_kinematics.find_pairs(contact.displacement.u, pairing.depth)
         self._full.set_state(committed)
         for contact in new:
-            contact.opposite.update_committed_jump()
-            found = replace(self._pairings[contact.name], opposite=contact.opposite.state())
+            contact.contact_kinematics.update_committed_jump()
+            found = replace(
+                self._pairings[contact.name], kinematics=contact.contact_kinematics.state()
+            )
             self._pairings[contact.name] = found
 
     def _is_chosen(self, contact: Contact) -> bool:
         """Whether a state was chosen in which pairs are not found yet."""
         pairing = self._pairings.get(contact.name)
-        return pairing is not None and pairing.opposite is None
+        return pairing is not None and pairing.kinematics is None
 
     def begin(self, contacts: Sequence[Contact]) -> None:
         """Let an increment begin again, between the pairs found for it. Collective.
@@ -241,5 +243,5 @@ class OppositePoints:
         for contact in contacts:
             contact.states.restore()
             pairing = self._pairings.get(contact.name)
-            if pairing is not None and pairing.opposite is not None:
-                contact.states.begin_between(pairing.opposite)
+            if pairing is not None and pairing.kinematics is not None:
+                contact.states.begin_between(pairing.kinematics)

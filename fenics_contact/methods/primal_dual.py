@@ -31,7 +31,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.point_law import PointTangent
 from fenics_contact.contact.values import PointValues
 from fenics_contact.methods.equations import Equations
-from fenics_contact.methods.method import OwnMethod, SnesMethod, Tools
+from fenics_contact.methods.method import SnesMethod, SolverContext, StandaloneMethod
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.tolerances import FLAT
 from fenics_contact.types import Array
@@ -58,7 +58,7 @@ _ITERATED = {
 _DAMPED = 0.5
 
 
-class PrimalDual(OwnMethod):
+class PrimalDual(StandaloneMethod):
     """The method.
 
     Attributes:
@@ -67,13 +67,13 @@ class PrimalDual(OwnMethod):
 
     by_newton = True
 
-    def __init__(self, tools: Tools) -> None:
-        equations = self._equations = tools.equations
-        self.snes, own = tools.snes("primal_dual_", _OPTIONS, with_own=_ITERATED)
+    def __init__(self, context: SolverContext) -> None:
+        equations = self._equations = context.equations
+        self.snes, own = context.snes("primal_dual_", _OPTIONS, with_own=_ITERATED)
         self._newton = _MixedNewton(equations, self.snes, own_solver=own)
 
     def check(self) -> None:
-        """See `OwnMethod.check`: friction by springs, of a linear bulk."""
+        """See `StandaloneMethod.check`: friction by springs, of a linear bulk."""
         if not self.suits:
             raise ValueError(
                 "method is 'primal_dual', which needs friction with stiffness k_n and k_t, small "
@@ -83,7 +83,7 @@ class PrimalDual(OwnMethod):
 
     @property
     def suits(self) -> bool:
-        """See `OwnMethod.suits`."""
+        """See `StandaloneMethod.suits`."""
         full = self._equations.full
         rubs = any(contact.law.has_friction for contact in full.contacts)
         return rubs and full.bulk.linear and all(_suits(contact) for contact in full.contacts)
@@ -120,7 +120,11 @@ class _MixedNewton(SnesMethod):
         """What the next step takes away, into ``f``. Collective."""
         equations, system = self._equations, self._equations.system
         if not self._points:
-            self._share, self._sizes, self._damping = 1.0 / max(equations.hardness(), 1.0), [], 1.0
+            self._share, self._sizes, self._damping = (
+                1.0 / max(equations.stiffness_ratio(), 1.0),
+                [],
+                1.0,
+            )
             equations.set_state(x)
             self._points = [_Points(operator) for operator in system.operators]
         equations.residual(x, f)  # of the law as it is: that it vanishes ends the iteration
@@ -171,7 +175,7 @@ class _Points:
         contact = self._contact = operator.contact
         contact.evaluate()
         values = self._values = contact.values
-        self._jump = contact.opposite.present_jump()
+        self._jump = contact.contact_kinematics.present_jump()
         self._springs = _Springs(values, friction=contact.law.has_friction)
         before: Array = np.zeros(len(self._jump))
         if contact.multipliers is None:
@@ -191,14 +195,14 @@ class _Points:
         """
         self._share = share
         contact, springs = self._contact, self._springs
-        jump = contact.opposite.present_jump()
+        jump = contact.contact_kinematics.present_jump()
         moved = springs.felt(jump - self._jump)
         answer = _times(self.tangent, moved) - damping * self._correction
         self._misfit = self._misfit + moved - _times(springs.compliance, answer)
         self._jump = jump
-        with contact.opposite.displaced((self._share - 1.0) * self._misfit):
+        with contact.contact_kinematics.displaced((self._share - 1.0) * self._misfit):
             contact.evaluate()
-            tangent = contact.acting.tangent().by_jump
+            tangent = contact.effective_law.tangent().by_jump
         self._values = contact.values
         self.tangent = springs.exact(tangent, self._values)
 

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import agreed
+from fenics_contact.parallel import broadcast_from_root
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["LooseModes"]
+__all__ = ["UnconstrainedModes"]
 
 # Gaps that a step goes through along a mode that is open: half of it touches, as well.
 _BEYOND = 2.0
@@ -29,7 +29,7 @@ _LEAST_GAP = 1e-64
 
 
 @dataclass(frozen=True)
-class LooseModes:
+class UnconstrainedModes:
     """Rigid-body modes that contact leaves free at an evaluated state, the same on every rank.
 
     Attributes:
@@ -56,7 +56,7 @@ class LooseModes:
         load: Array,
         tractions: Sequence[Array],
         idle: Mask,
-    ) -> LooseModes:
+    ) -> UnconstrainedModes:
         """Find them, and the forces on them. Collective.
 
         The tangent of friction is none along the friction of a slipping point.
@@ -94,7 +94,7 @@ class LooseModes:
         group = groups[np.argmax(np.abs(loose), axis=1)]
         # Sums of round-off count as no force: no share of them would ever be in balance.
         size = np.where(size > scales.round_off_of_groups[group], size, 0.0)
-        left = agreed(motions.comm, np.where(size > 0.0, resultant + work, 0.0))
+        left = broadcast_from_root(motions.comm, np.where(size > 0.0, resultant + work, 0.0))
         part = np.abs(left) / np.where(size > 0.0, size, 1.0)
         np.fmax.at(share, group, np.minimum(part, 1.0))
         ways = np.where(left < 0.0, -1.0, 1.0)[:, None] * loose

@@ -17,27 +17,33 @@ from fenics_contact.arguments import check_bool, check_instance, is_number
 from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
-from fenics_contact.methods.alternating import Alternation
 from fenics_contact.methods.attempt import Attempt
+from fenics_contact.methods.augmented_lagrangian import INNER, solve_augmented_lagrangian
 from fenics_contact.methods.continuation import Continuation
 from fenics_contact.methods.equations import Equations
-from fenics_contact.methods.kept import Kept
+from fenics_contact.methods.linearised_solve import linearised, respond
 from fenics_contact.methods.load_balance import check_balance
-from fenics_contact.methods.method import Method, Newton, OwnMethod, SnesMethod, Tools
-from fenics_contact.methods.neighbourhood import linearised, respond
+from fenics_contact.methods.method import (
+    Method,
+    Newton,
+    SnesMethod,
+    SolverContext,
+    StandaloneMethod,
+)
 from fenics_contact.methods.options import Defaults, take_command_line
+from fenics_contact.methods.predictor import Predictor
 from fenics_contact.methods.primal_dual import PrimalDual
 from fenics_contact.methods.quasi_newton import QuasiNewton
-from fenics_contact.methods.rounds import INNER, solve_in_rounds
-from fenics_contact.methods.starts import Starts
+from fenics_contact.methods.retained_dofs import RetainedDofs
+from fenics_contact.methods.tresca_fixed_point import TrescaFixedPoint
 from fenics_contact.parallel import global_max
 from fenics_contact.systems import linear
-from fenics_contact.systems.choice import linear_kind, reason_not_to_condense
 from fenics_contact.systems.condensed import CondensedSystem
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
+from fenics_contact.systems.solver_selection import linear_kind, reason_not_to_condense
 from fenics_contact.systems.system import System
-from fenics_contact.systems.unknowns import Selection
+from fenics_contact.systems.unknowns import DofSubset
 from fenics_contact.types import Array, Indices, Mask
 
 __all__ = ["METHODS", "Settings", "Solver"]
@@ -82,7 +88,7 @@ _NAMES_A_SOLVER = ("ksp_type", "pc_type", "pc_factor_mat_solver_type")
 METHODS: dict[str, type[Method]] = {
     "lbfgs": QuasiNewton,
     "newton": Newton,
-    "alternating": Alternation,
+    "alternating": TrescaFixedPoint,
     "primal_dual": PrimalDual,
     "continuation": Continuation,
 }
@@ -149,26 +155,26 @@ class Solver:
         condensed: Whether the unknowns that contact touches are iterated on alone.
         expected: How many increments are expected.
         methods: Further methods, by name.
-        starts: Where the iteration starts from.
+        predictor: Where the iteration starts from.
     """
 
     def __init__(self, full: FullSystem, motions: RigidBodyModes, settings: Settings) -> None:
         self.equations = Equations(full, motions, alpha=settings.alpha, phi=settings.phi)
         self.expected_increments = _EXPECTED
-        self.starts = Starts(self.equations)
+        self.predictor = Predictor(self.equations)
         self._full = full
         # Which the caller may change later.
         self._settings = replace(settings, petsc_options=dict(settings.petsc_options))
         self._comm = full.unknowns.comm
         self._obstacle: str | None = None  # to condensation, as last said
         self._pairings = self._present_pairings()  # those of the system
-        self._kept = Kept(full, all_that_pay=bool(settings.condensation))
+        self._retained = RetainedDofs(full, all_that_pay=bool(settings.condensation))
         # What is chosen and made by `_configure`, for the increments that are expected.
         self.options = Defaults()
         self._named: list[str] = []  # options given that name a linear solver
         self.condensed = False
         self.method = settings.method or "lbfgs"
-        self.methods: dict[str, OwnMethod] = {}
+        self.methods: dict[str, StandaloneMethod] = {}
         self.snes: PETSc.SNES
         self.main: SnesMethod
         take_command_line(settings.prefix, self._comm)
@@ -235,7 +241,7 @@ class Solver:
             equations.solvers[consistent] = ksp
         this: Solver = weakref.proxy(self)  # SNES would keep what keeps it
         main = QuasiNewton if quasi_newton else Newton
-        self.main = main(equations, snes, lambda: this.may_go_on())
+        self.main = main(equations, snes, lambda: this.can_fall_back())
         self._forget_matrices()
         self.main.attach(consistent=not quasi_newton)
         options.let_read(snes)
@@ -248,10 +254,10 @@ class Solver:
             return self.system.linear_solver(symmetric=symmetric, accurate=True) | newton
 
         self.methods = {}
-        tools = Tools(equations, options, prefix, newton_solver)
+        context = SolverContext(equations, options, prefix, newton_solver)
         for name, kind in METHODS.items():
-            if issubclass(kind, OwnMethod):
-                self.methods[name] = kind(tools)
+            if issubclass(kind, StandaloneMethod):
+                self.methods[name] = kind(context)
         asked_for = self.methods.get(settings.method or "")
         if asked_for is not None:
             asked_for.check()
@@ -282,7 +288,7 @@ class Solver:
             linear_solver=self._settings.linear_solver,
             named=self._named,
             increments=self.expected_increments,
-            n_kept=self._kept.count,
+            n_retained=self._retained.count,
         )
         if obstacle and obstacle != self._obstacle and self._comm.rank == 0:
             logger.info("no static condensation: %s", obstacle)
@@ -321,10 +327,10 @@ class Solver:
     # ---- the system ------------------------------------------------------------------------------
 
     def _set_system(self) -> None:
-        """Take the system to iterate on: all unknowns, or those to be kept. Collective."""
+        """Take the system to iterate on: all unknowns, or those to be retained. Collective."""
         system: System = self._full
         if self.condensed:
-            selection = Selection(self._full.unknowns, self._kept.indices)
+            selection = DofSubset(self._full.unknowns, self._retained.indices)
             prefix = self._settings.prefix + "interior_"
             system = CondensedSystem(self._full, selection, prefix=prefix)
             if self._comm.rank == 0:
@@ -335,8 +341,8 @@ class Solver:
             self.equations.take(system)
 
     def _present_pairings(self) -> list[int]:
-        # Matrices of pairs that follow the bodies are made for each anew, and no one is kept.
-        return [0 if c.opposite.follows else c.pairs.number for c in self._full.contacts]
+        # Matrices of pairs that follow the bodies are made for each anew, and no one is retained.
+        return [0 if c.contact_kinematics.follows else c.pairs.number for c in self._full.contacts]
 
     def is_current(self) -> bool:
         """Whether bulk and pairs are those of the last solution. Collective."""
@@ -345,33 +351,33 @@ class Solver:
     def update_system(self, stiffness_changed: bool) -> None:
         """Follow changes of the pairs and of the bulk's tangent. Collective."""
         if self._pairings != self._present_pairings():
-            if not self.condensed or self._kept.grows():
+            if not self.condensed or self._retained.grows():
                 self._set_system()
             self._pairings = self._present_pairings()
             self._make_matrices()
         if stiffness_changed or not self.system.ready:
             self.equations.factorisations += self.system.update()
 
-    # ---- the unknowns that are kept --------------------------------------------------------------
+    # ---- the retained dofs -----------------------------------------------------------------------
 
-    def chooses(self) -> bool:
+    def select_dofs(self) -> bool:
         """Whether an increment that starts here takes other unknowns; then `change`. Collective.
 
         That is so where the first one starts, and where those that bear have other opposites.
         """
         others = self.condensed and self._pairings != self._present_pairings()
-        return self._kept.chooses(other_pairs=others)
+        return self._retained.select_dofs(other_pairs=others)
 
-    def misses(self, *, found: bool) -> bool:
-        """Whether contact takes more unknowns than are kept: then `change`. Collective.
+    def needs_more_dofs(self, *, found: bool) -> bool:
+        """Whether contact takes more unknowns than are retained: then `change`. Collective.
 
         Args:
             found: Whether there is a solution; if so contacts are evaluated on all of Γc.
         """
         if not self.system.confined:
             return False
-        misses = self._kept.misses(self.system.operators, found=found)
-        # A body that nothing else holds may find no rest on what is kept.
+        misses = self._retained.needs_more_dofs(self.system.operators, found=found)
+        # A body that nothing else holds may find no rest on what is retained.
         return misses or (not found and len(self.equations.motions.free) > 0)
 
     def change(self, *, anew: bool) -> None:
@@ -380,29 +386,29 @@ class Solver:
         The state is that in which the increment starts.
 
         Args:
-            anew: Whether what is kept now may be dropped where all would be too much.
+            anew: Whether what is retained now may be dropped where all would be too much.
         """
-        self._kept.change(anew=anew)
+        self._retained.change(anew=anew)
         if self._choose_condensation() != self.condensed:
             self._configure_anew()
         elif self.condensed:
             self._set_system()
             self._make_matrices()
 
-    def keep(self, kept: Indices) -> None:
-        """Iterate on the unknowns that another run had kept, on all if it had. Collective."""
-        some = self._comm.allreduce(kept.size) > 0
+    def keep(self, retained: Indices) -> None:
+        """Iterate on the unknowns that another run had retained, on all if it had. Collective."""
+        some = self._comm.allreduce(retained.size) > 0
         anew = some != self.condensed and self._settings.condensation is None
         if some and self.condensed:
-            self._kept.indices = kept
+            self._retained.indices = retained
             self._set_system()
-        elif anew and not self._kept.is_all:
-            self._kept.indices = kept if some else self._kept.touched()
+        elif anew and not self._retained.is_all:
+            self._retained.indices = retained if some else self._retained.touched()
             self._configure_anew()
-        self._kept.chosen = True
+        self._retained.chosen = True
 
     def restart(self) -> None:
-        """Drop what is kept from earlier increments. Collective."""
+        """Drop what is retained from earlier increments. Collective."""
         self.system.forget()
         self._make_matrices()
 
@@ -419,7 +425,7 @@ class Solver:
 
     def _forget_matrices(self) -> None:
         self.equations.forget_matrices()
-        self.starts.forget()
+        self.predictor.forget()
 
     # ---- solving ---------------------------------------------------------------------------------
 
@@ -453,7 +459,7 @@ class Solver:
             changed = first_round and stiffness_changed
             return self._iterate(first_round, cold, changed, balance=balance, fallback=fallback)
 
-        return solve_in_rounds(equations, iterate, load_before)
+        return solve_augmented_lagrangian(equations, iterate, load_before)
 
     def _iterate(
         self,
@@ -470,9 +476,9 @@ class Solver:
             Reason, and what was tried.
         """
         equations = self.equations
-        factored = self.starts.factored
-        equations.watch.start()
-        chosen = self.starts.choose(first_round=first_round, cold=cold)
+        factored = self.predictor.factored
+        equations.monitor.start()
+        chosen = self.predictor.choose(first_round=first_round, cold=cold)
         start: Array = np.divide(chosen, equations.length)
         attempts: list[Attempt] = []
         methods: Iterable[str] = self._chain(start, fallback=fallback, balance=balance)
@@ -482,7 +488,7 @@ class Solver:
         equations.overload = None
         for method in methods:
             equations.solution.array[:] = start
-            equations.watch.start()
+            equations.monitor.start()
             if stiffness_changed:
                 equations.h0_is_made = False
             iterations, reason = self.methods.get(method, self.main).solve()
@@ -500,7 +506,7 @@ class Solver:
         if reason > 0 and newton and (factored or made > 0):
             # With a linear bulk a start by the tangent comes first even where it is far off, which
             # a load that falls to nothing does not forgive after continuation.
-            self.starts.keep(predict=own is None or not self._full.bulk.linear)
+            self.predictor.keep(predict=own is None or not self._full.bulk.linear)
         return int(reason), attempts
 
     def _chain(self, start: Array, *, fallback: bool, balance: bool) -> Iterator[str]:
@@ -518,7 +524,7 @@ class Solver:
             x.destroy()
             self._full.evaluate()
             check_balance(self.equations.motions, self._full.load, self._full.operators)
-        if fallback and self.may_go_on():
+        if fallback and self.can_fall_back():
             others = (name for name in _FALLBACKS if name != self.method)
             yield from (name for name in others if self.methods[name].suits)
 
@@ -529,9 +535,9 @@ class Solver:
         if (overload := self.equations.overload) is not None:
             return overload.in_words()
         words = _OUTCOMES.get(reason, f"SNES reason {reason}")
-        return "; ".join(filter(None, (words, self.equations.watch.chattering())))
+        return "; ".join(filter(None, (words, self.equations.monitor.chattering())))
 
-    def may_go_on(self) -> bool:
+    def can_fall_back(self) -> bool:
         """Whether to go on after a failure: not if iterations are rationed by the caller."""
         return bool(
             self._settings.fallback and self.main.max_it >= self._main_options()["snes_max_it"]
@@ -547,11 +553,11 @@ class Solver:
         self, springs: Sequence[Array], load: Array
     ) -> AbstractContextManager[Callable[[Sequence[Array] | None], Array]]:
         """See `ContactProblem.linearised`, about a complete state under a load. Collective."""
-        if self.chooses():
+        if self.select_dofs():
             self.change(anew=True)
         # After a history that was taken up and is at its end nothing has been assembled yet.
         self.update_system(self._full.update_stiffness())
-        self.starts.forget()  # the matrix that is about to be used is another one
+        self.predictor.forget()  # the matrix that is about to be used is another one
         self.system.begin(load)
         return linearised(self.equations, springs)
 
@@ -570,13 +576,13 @@ class Solver:
         """
         full, present = self._full, self._full.state()
         moved = None
-        with self.system.acting():
+        with self.system.restricted_contacts():
             try:
                 for operator in self.system.operators:
                     within = operator.within
                     for contact, points in acting:
                         if contact is operator.contact:
-                            contact.confine(points if within is None else points & within)
+                            contact.restrict_to(points if within is None else points & within)
                 if not full.bulk.linear:  # a bulk that conditions have moved into may be inverted
                     moved = present - start
                     full.set_state(start)
@@ -589,13 +595,13 @@ class Solver:
                 springs = [
                     c.values.springs(s, s) for c, s in zip(full.contacts, closed, strict=True)
                 ]
-                self.starts.forget()  # the matrix that is about to be used is another one
+                self.predictor.forget()  # the matrix that is about to be used is another one
                 with linearised(self.equations, springs, prescribed=moved) as solve:
                     return present + solve(None)
             finally:
                 self.equations.filled.discard(True)  # it is that of another state
                 for contact, _ in acting:
-                    contact.confine()
+                    contact.restrict_to()
                 full.set_state(present)
                 if not full.bulk.linear:
                     full.update_stiffness()

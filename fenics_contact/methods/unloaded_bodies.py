@@ -44,7 +44,7 @@ def move_unloaded_bodies(equations: Equations, part: Callable[[Array], Array]) -
     present = [contact.values for contact in full.contacts]
     modes = motions.find_unloaded(full.operators, [committed, present])
     # Of a body with conditions that move it the least motion is not to stay where it is.
-    change = np.where(full.constrained, full.state() - equations.began, 0.0)
+    change = np.where(full.constrained, full.state() - equations.initial_unknowns, 0.0)
     modes = modes[~motions.move_any(modes, full.scales.largest(change) > 0.0)]
     groups = motions.groups()[np.argmax(np.abs(modes), axis=1)] if len(modes) else np.zeros(0)
     moved = [_move(equations, part, modes[groups == n], int(n)) for n in np.unique(groups)]
@@ -70,7 +70,7 @@ def _move(equations: Equations, part: Callable[[Array], Array], modes: Array, gr
     # Where a force acts these modes close no gap, but for round-off.
     free = [~normal for normal, _ in acting]
     for _ in range(_LINEARISATIONS):
-        since = motions.fit(full.state() - equations.began, part)
+        since = motions.fit(full.state() - equations.initial_unknowns, part)
         present = [contact.values for contact in full.contacts]
         change = find_least_motion(full, motions, modes, present, since, free)
         if change is None or np.abs(change).max() <= least:

@@ -145,7 +145,7 @@ class Animation:
             if self._comm.rank == 0:
                 frames = self._drawn()
                 first = next(frames)
-                with files.replacing(self.path) as temporary:
+                with files.atomic_write(self.path) as temporary:
                     first.save(
                         temporary,
                         save_all=True,

@@ -468,7 +468,7 @@ def scale_of(low: float, high: float) -> Any:
 def save(figure: Any, path: str | os.PathLike[str]) -> None:
     """Write a figure; the file is complete or as before."""
     try:
-        with files.replacing(path) as temporary:
+        with files.atomic_write(path) as temporary:
             figure.savefig(temporary, dpi=150)
     finally:
         pyplot().close(figure)

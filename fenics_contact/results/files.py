@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["check_file", "check_folder", "make_folder", "replacing"]
+__all__ = ["atomic_write", "check_file", "check_folder", "make_folder"]
 
 
 def check_file(path: Path) -> None:
@@ -61,7 +61,7 @@ def make_folder(path: Path) -> None:
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A name to write to, which takes the place of ``path`` once the block has ended well.
 
     Else ``path`` is as before. On the calling rank only.

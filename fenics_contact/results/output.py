@@ -130,5 +130,5 @@ def write_json(path: str | os.PathLike[str], data: Mapping[str, Any], comm: MPI.
     with collective_errors(comm):
         if comm.rank == 0:
             text = json.dumps(data, indent=2, default=float, allow_nan=False) + "\n"
-            with files.replacing(path) as temporary:
+            with files.atomic_write(path) as temporary:
                 temporary.write_text(text)

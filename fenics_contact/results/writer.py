@@ -170,11 +170,11 @@ class Writer:
                 states[name] = [*kept, (time, f"{name}_{len(kept):04d}.vtu")]
                 dropped += [file for _, file in self._series[name][len(kept) + 1 :]]
                 vtu.write_series(
-                    stack.enter_context(files.replacing(self._path(name))), states[name]
+                    stack.enter_context(files.atomic_write(self._path(name))), states[name]
                 )
             for name, grid in grids.items():
                 path = self.folder / states[name][-1][1]
-                vtu.write_grid(stack.enter_context(files.replacing(path)), grid)
+                vtu.write_grid(stack.enter_context(files.atomic_write(path)), grid)
         self._series = states
         for file in dropped:
             (self.folder / Path(file).name).unlink(missing_ok=True)

@@ -21,21 +21,21 @@ from fenics_contact.parallel import collective_errors, global_sum
 from fenics_contact.systems.balance import Labels, by_body
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.dissection import Dissection, Eliminated
-from fenics_contact.systems.unknowns import Selection
+from fenics_contact.systems.unknowns import DofSubset
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index, Indices, Mask
 
 __all__ = ["Condensation", "ParticularSolution"]
 
 
-# Directions of loads whose particular solutions are kept.
+# Directions of loads whose particular solutions are retained.
 _DIRECTIONS = 4
 
 
 class Condensation:
     """A stiffness with all but some of its unknowns eliminated.
 
-    Prescribed unknowns that are not kept are held at the values they have. The constructor is
+    Prescribed unknowns that are not retained are held at the values they have. The constructor is
     collective.
 
     Args:
@@ -47,13 +47,13 @@ class Condensation:
         label: Body of every unknown of this rank, (n_local,); by default there is one body.
 
     Attributes:
-        schur: The condensed stiffness, (n_kept, n_kept) on the first rank, Fortran order
+        schur: The condensed stiffness, (n_retained, n_retained) on the first rank, Fortran order
             (force/length).
-        response: What the load of `set_load` makes of the body with the unknowns kept at rest.
+        response: What the load of `set_load` makes of the body with the unknowns retained at rest.
         directions: Loads that were solved for, scaled, and what they make of it.
 
     Raises:
-        RuntimeError: The stiffness is singular even with the kept unknowns held.
+        RuntimeError: The stiffness is singular even with the retained unknowns held.
         MemoryError: There is not enough.
     """
 
@@ -61,7 +61,7 @@ class Condensation:
         self,
         stiffness: PETSc.Mat,
         bulk: Bulk,
-        unknowns: Selection,
+        unknowns: DofSubset,
         constrained: Mask,
         *,
         prefix: str = "",
@@ -69,11 +69,14 @@ class Condensation:
     ) -> None:
         self._stiffness, self._unknowns, self._comm = stiffness, unknowns, unknowns.comm
         outside = np.ones(constrained.size, dtype=np.bool_)
-        outside[unknowns.kept] = False
+        outside[unknowns.retained] = False
         self._held = np.flatnonzero(outside & constrained).astype(np.int32)
         label = np.zeros(constrained.size, dtype=np.intp) if label is None else label
         self._label = np.concatenate([label, label[self._held]])
-        self._labels = label, unknowns.gathered(label[unknowns.kept].astype(np.float64)).astype(int)
+        self._labels = (
+            label,
+            unknowns.gathered(label[unknowns.retained].astype(np.float64)).astype(int),
+        )
         self._n_bodies = 1 + self._comm.allreduce(int(label.max(initial=0)), op=MPI.MAX)
         self._right, self._left = stiffness.createVecs()
         self.directions: list[tuple[Array, ParticularSolution]] = []
@@ -98,23 +101,23 @@ class Condensation:
         self._stiffness.mult(self._right, self._left)
         return self._left.array_r.copy()
 
-    def _solve(self, force: Array, kept: Array) -> Array:
+    def _solve(self, force: Array, retained: Array) -> Array:
         """All unknowns under a force on those eliminated, (n_local,), zero if held. Collective.
 
         Args:
             force: At this rank's unknowns, (n_local,) (force).
-            kept: Displacement of the unknowns kept, (n_kept,) on the first rank.
+            retained: Displacement of the unknowns retained, (n_retained,) on the first rank.
         """
         own, result = self._piece, np.zeros_like(force)
         applied = np.zeros(own.size)
         applied[own.inner] = force[own.unknowns[own.inner]]
         partial = self._dissection.push(applied)
         boundary, result[own.interface] = self._interface.solve(
-            partial.pushed[own.boundary], force[own.interface], kept
+            partial.pushed[own.boundary], force[own.interface], retained
         )
         state = self._dissection.complete(boundary, partial)
         result[own.unknowns[own.inner]] = state[own.inner]
-        result[self._unknowns.kept] = self._unknowns.scattered(kept)
+        result[self._unknowns.retained] = self._unknowns.scattered(retained)
         return result
 
     def set_load(self, force: Array, state: Array) -> None:
@@ -122,7 +125,7 @@ class Condensation:
 
         Args:
             force: External force on all unknowns, (n_local,) (force).
-            state: Displacements, of which those prescribed outside of the kept count, (n_local,).
+            state: Displacements; used are those prescribed at eliminated unknowns, (n_local,).
         """
         # The loads of a history are a few fields, each times a number: what was found for earlier
         # ones serves as far as the new one is a combination of them.
@@ -172,29 +175,29 @@ class Condensation:
         at_rest = np.zeros(self._unknowns.n_local)
         field = prescribed + self._solve(force - lift, at_rest)
         image = self._product(field)
-        kept = self._unknowns.kept
-        load = self._unknowns.gathered((force - image)[kept])
+        retained = self._unknowns.retained
+        load = self._unknowns.gathered((force - image)[retained])
         # Apart: the share of the prescribed values in the condensed load.
         by_values = np.zeros_like(load)
         if has_values:
             still = field if not has_force else prescribed - self._solve(lift, at_rest)
-            by_values = -self._unknowns.gathered(self._product(still)[kept])
+            by_values = -self._unknowns.gathered(self._product(still)[retained])
         at_field = force.copy()
         at_field[self._held] = image[self._held]
-        at_field[kept] = 0.0
+        at_field[retained] = 0.0
         return ParticularSolution(field, at_field, load, by_values)
 
     def forget(self) -> None:
         """Drop the solutions for earlier loads."""
         self.directions = []
 
-    def extended(self, kept: Array) -> Array:
-        """All unknowns without load, (n_local,), that follow from those kept. Collective.
+    def extended(self, retained: Array) -> Array:
+        """All unknowns without load, (n_local,), that follow from those retained. Collective.
 
         Args:
-            kept: On the first rank, (n_kept,).
+            retained: On the first rank, (n_retained,).
         """
-        return self._solve(np.zeros(self._right.getLocalSize()), kept)
+        return self._solve(np.zeros(self._right.getLocalSize()), retained)
 
 
 @dataclass(frozen=True)
@@ -204,12 +207,12 @@ class _Piece:
     Attributes:
         size: Unknowns of the piece.
         unknowns: Their numbers among those of this rank, ghosts behind its own, (size,).
-        inner: Those that no other rank has and that are not kept, as numbers in the piece.
+        inner: Those that no other rank has and that are not retained, as numbers in the piece.
         boundary: The others, likewise.
         numbers: Global numbers of these, (n_boundary,).
         places: Of all of them, (size, gdim).
         interface: Unknowns of this rank, by its numbers, at which pieces meet and that are neither
-            kept nor prescribed.
+            retained nor prescribed.
     """
 
     unknowns: Indices
@@ -229,7 +232,7 @@ class _Piece:
         cls,
         stiffness: PETSc.Mat,
         space: fem.FunctionSpace,
-        unknowns: Selection,
+        unknowns: DofSubset,
         constrained: Mask,
     ) -> _Piece:
         """Number. Collective.
@@ -241,25 +244,27 @@ class _Piece:
             constrained: Mask of the prescribed unknowns among all of this rank.
         """
         n = unknowns.whole.n_dofs
-        kept = np.zeros(unknowns.whole.n_local, dtype=np.bool_)
-        kept[unknowns.kept] = True
-        kept, constrained = kept[:n], constrained[:n]
+        retained = np.zeros(unknowns.whole.n_local, dtype=np.bool_)
+        retained[unknowns.retained] = True
+        retained, constrained = retained[:n], constrained[:n]
         if unknowns.comm.size == 1:
             here = np.ones(n, dtype=np.bool_)
             shared = np.zeros(n, dtype=np.bool_)
         else:
             here = _acted_on(stiffness)
             shared = _over_ranks(space, here, add=True) > 1.5
-            kept, constrained = (_over_ranks(space, mask) > 0.5 for mask in (kept, constrained))
+            retained, constrained = (
+                _over_ranks(space, mask) > 0.5 for mask in (retained, constrained)
+            )
             here[:n] |= ~shared[:n]  # what has no stiffness at all is told by the factorisation
-        free = here & (kept | ~constrained)
+        free = here & (retained | ~constrained)
         chosen = np.flatnonzero(free).astype(np.int32)
-        stays = (kept | shared)[chosen]
+        stays = (retained | shared)[chosen]
         dofmap = space.dofmap
         d = dofmap.index_map_bs
         boundary = np.flatnonzero(stays).astype(np.int32)
         nodes = dofmap.index_map.local_to_global((chosen[boundary] // d).astype(np.int32))
-        interface = (shared & ~kept & ~constrained)[:n]
+        interface = (shared & ~retained & ~constrained)[:n]
         return cls(
             unknowns=chosen,
             inner=np.flatnonzero(~stays).astype(np.int32),
@@ -295,9 +300,9 @@ def _over_ranks(space: fem.FunctionSpace, marks: Mask, *, add: bool = False) -> 
 
 
 class _Interface:
-    """What the first rank makes of the pieces: sums at the unknowns kept and at the interface."""
+    """Sums of the pieces at the retained unknowns and at the interface, on the first rank."""
 
-    def __init__(self, piece: _Piece, unknowns: Selection) -> None:
+    def __init__(self, piece: _Piece, unknowns: DofSubset) -> None:
         """Number. Collective."""
         self._comm = unknowns.comm
         shares = self._comm.allgather(unknowns.whole.first + piece.interface.astype(np.int64))
@@ -311,7 +316,7 @@ class _Interface:
         found[inside] = between[place[inside]] == piece.numbers[inside]
         dofs = unknowns.numbers[: unknowns.first_motion]
         place[~found] = between.size + np.searchsorted(dofs, piece.numbers[~found])
-        # Of every piece where its boundary is among the interface and the unknowns kept behind.
+        # Of every piece where its boundary is among the interface and the unknowns retained behind.
         self._places: list[Index] = self._comm.gather(place) or [place]
         self._between: Eliminated | None = None  # on the first rank
 
@@ -344,13 +349,13 @@ class _Interface:
             total.T[np.ix_(place, place)] += part.T
         return total
 
-    def solve(self, pushed: Array, force: Array, kept: Array) -> tuple[Array, Array]:
+    def solve(self, pushed: Array, force: Array, retained: Array) -> tuple[Array, Array]:
         """Displacement of boundary and interface. Collective.
 
         Args:
             pushed: What the inner unknowns do to the boundary of this piece, (n_boundary,).
             force: What acts at this rank's part of the interface.
-            kept: Displacement of the unknowns kept, (n_kept,) on the first rank.
+            retained: Displacement of the unknowns retained, (n_retained,) on the first rank.
 
         Returns:
             Of the boundary of this piece, (n_boundary,), and of this rank's part of the interface.
@@ -359,12 +364,12 @@ class _Interface:
         self._comm.Gatherv(force, (applied, self._counts))
         n, state = self._n_between, np.zeros(self._size)
         if parts is not None:
-            state[n:] = kept
+            state[n:] = retained
             if self._between is not None:
-                total = np.append(applied, np.zeros_like(kept))
+                total = np.append(applied, np.zeros_like(retained))
                 for place, part in zip(self._places, parts, strict=True):
                     total[place] += part
-                state[:n] = self._between.at_rest(total[:n]) + self._between.carried(kept)
+                state[:n] = self._between.at_rest(total[:n]) + self._between.carried(retained)
         return self._spread(state)
 
     def _spread(self, state: Array) -> tuple[Array, Array]:
@@ -381,12 +386,12 @@ class _Interface:
 
 @dataclass
 class ParticularSolution:
-    """Of a body to its loads and prescribed values, linear in them; the unknowns kept at rest.
+    """Of a body to its loads and prescribed values, linear in them; the unknowns retained at rest.
 
     Attributes:
-        field: Displacement p of all unknowns, zero at those kept, (n_local,).
-        forces: K p at the unknowns eliminated, zero at those kept, (n_local,) (force).
-        load: The condensed external force g, on the first rank, (n_kept,) (force).
+        field: Displacement p of all unknowns, zero at those retained, (n_local,).
+        forces: K p at the unknowns eliminated, zero at those retained, (n_local,) (force).
+        load: The condensed external force g, on the first rank, (n_retained,) (force).
         by_values: The part of it that the prescribed values make, likewise (force).
     """
 
@@ -396,9 +401,9 @@ class ParticularSolution:
     by_values: Array
 
     @classmethod
-    def none(cls, n: int, n_kept: int) -> ParticularSolution:
+    def none(cls, n: int, n_retained: int) -> ParticularSolution:
         """To nothing."""
-        return cls(np.zeros(n), np.zeros(n), np.zeros(n_kept), np.zeros(n_kept))
+        return cls(np.zeros(n), np.zeros(n), np.zeros(n_retained), np.zeros(n_retained))
 
     @classmethod
     def combined(
@@ -406,7 +411,7 @@ class ParticularSolution:
         shares: Sequence[Array],
         responses: Sequence[ParticularSolution],
         label: Labels,
-        kept: Labels,
+        retained: Labels,
     ) -> ParticularSolution:
         """The sum of shares of some, at least one.
 
@@ -414,7 +419,7 @@ class ParticularSolution:
             shares: Of every response that of each body, (n_bodies,).
             responses: The responses.
             label: Body of every unknown, (n_local,).
-            kept: That of the unknowns kept, on the first rank, (n_kept,).
+            retained: That of the unknowns retained, on the first rank, (n_retained,).
         """
 
         def total(parts: Sequence[Array], label: Labels) -> Array:
@@ -426,6 +431,6 @@ class ParticularSolution:
         return cls(
             total([r.field for r in responses], label),
             total([r.forces for r in responses], label),
-            total([r.load for r in responses], kept),
-            total([r.by_values for r in responses], kept),
+            total([r.load for r in responses], retained),
+            total([r.by_values for r in responses], retained),
         )

@@ -19,10 +19,10 @@ from fenics_contact.systems.dense import Sum, UpdatedLU
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.system import System
-from fenics_contact.systems.unknowns import Selection
+from fenics_contact.systems.unknowns import DofSubset
 from fenics_contact.types import Array, Indices
 
-__all__ = ["CondensedSystem", "all_kept", "inexpensive", "worthwhile"]
+__all__ = ["CondensedSystem", "all_retained", "inexpensive", "worthwhile"]
 
 # Dense matrices of this many unknowns take 200 MB each, and there are five or so.
 _LARGEST = 5000
@@ -35,42 +35,42 @@ _SMALL = 500
 _SURFACE_SHARE = {2: 3.0, 3: 1.2}
 # In the plane, up to this many and this share, it costs more than that, and less than the dozens of
 # iterations that all unknowns take. Two cylinders of `demos/fretting.py`, by cells in the contact's
-# half-width: unknowns and those kept, seconds condensed and not, pressed by one increment without
+# half-width: all and retained unknowns, seconds condensed and not, pressed by one increment without
 # friction, then sheared to and fro by 20 (25 at first):
 #     16: 9,724, 596: 0.7 and 1.4, 2.2 and 8.6;  20: 12,604, 736: 1.2 and 1.9, 2.4 and 7.9;
 #     40: 32,256, 1004, the pressing all but on all unknowns: 4.1 and 24.
 _QUICK, _QUICK_SHARE = 1200, 8.0
-# Share of these up to which what is kept is hardly felt in the cost.
+# Share of these up to which what is retained is hardly felt in the cost.
 _CHEAP = 0.25
-# Share of these up to which all that contact touches is kept. Where some is left out every
+# Share of these up to which all that contact touches is retained. Where some is left out every
 # increment takes a back-substitution, which in the plane costs more than fewer unknowns save.
 _ALL = {2: 1.0, 3: 0.5}
 
 
-def worthwhile(n: int, n_kept: int, dimension: int) -> bool:
-    """Whether to condense ``n`` unknowns onto ``n_kept`` by memory and cost.
+def worthwhile(n: int, n_retained: int, dimension: int) -> bool:
+    """Whether to condense ``n`` unknowns onto ``n_retained`` by memory and cost.
 
     The Schur complement comes with the factorisation: in two dimensions at no more than the cost
-    of a plain one (0.45 s against 0.55 s at 104,000 unknowns, 670 kept), in three at 2.3 times that
-    (106,000 unknowns, 768 kept). With contact the iteration on all unknowns nearly always takes
+    of a plain one (0.45 s against 0.55 s at 104,000 unknowns, 670 retained), in three at 2.3 times
+    (106,000 unknowns, 768 retained). With contact the iteration on all unknowns nearly always takes
     more factorisations, or back-substitutions for the price of as many.
     """
-    return 0 < n_kept <= _most(n, dimension)
+    return 0 < n_retained <= _most(n, dimension)
 
 
 def _most(n: int, dimension: int) -> float:
-    """How many of ``n`` unknowns are worth to be kept."""
+    """How many of ``n`` unknowns are worth to be retained."""
     surface = n ** ((dimension - 1) / dimension)
     quick = min(_QUICK, _QUICK_SHARE * surface) if dimension == 2 else 0.0
     return min(_LARGEST, max(_SMALL, quick, _SURFACE_SHARE[dimension] * surface))
 
 
 def inexpensive(n: int, dimension: int) -> int:
-    """How many of ``n`` unknowns cost next to nothing more than fewer when they are kept."""
+    """How many of ``n`` unknowns cost next to nothing more than fewer when they are retained."""
     return int(max(_SMALL, _CHEAP * _most(n, dimension)))
 
 
-def all_kept(n: int, n_touched: int, dimension: int) -> bool:
+def all_retained(n: int, n_touched: int, dimension: int) -> bool:
     """Whether to keep all that contact touches, whatever part of it may come into contact."""
     return n_touched <= max(2 * _SMALL, _ALL[dimension] * _most(n, dimension))
 
@@ -84,28 +84,28 @@ class CondensedSystem(System):
         prefix: Of the options of the factorisation.
     """
 
-    unknowns: Selection
+    unknowns: DofSubset
     # A dense factorisation costs no more than ten iterations. With fewer in a round L-BFGS is
     # Newton's method without a globalisation, and fails at a stiffness of 100 E/h.
     iterations_per_round = 8
 
-    def __init__(self, full: FullSystem, unknowns: Selection, *, prefix: str = "") -> None:
-        kept = unknowns.kept
+    def __init__(self, full: FullSystem, unknowns: DofSubset, *, prefix: str = "") -> None:
+        retained = unknowns.retained
         super().__init__(
             full.u,
             unknowns,
             full.bulk,
             full.contacts,
-            unknowns.gathered(full.constrained[kept].astype(np.float64)) > 0.5,
-            unknowns.gathered(full.label[kept].astype(np.float64)).astype(np.intp),
+            unknowns.gathered(full.constrained[retained].astype(np.float64)) > 0.5,
+            unknowns.gathered(full.label[retained].astype(np.float64)).astype(np.intp),
             full.n_bodies,
         )
         self.ready, self.scales = False, full.scales
-        self.mark = object()
+        self.coordinate_id = object()
         self._fixed: Array | None = None  # the constant part of the matrices
         self._full, self._prefix = full, prefix
-        # This rank's dofs among those kept; motions are behind all of them.
-        self._kept_dofs = kept[kept < unknowns.whole.n_dofs]
+        # This rank's dofs among those retained; motions are behind all of them.
+        self._retained_dofs = retained[retained < unknowns.whole.n_dofs]
         self._condensation: Condensation | None = None
 
     def linear_solver(self, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
@@ -126,7 +126,7 @@ class CondensedSystem(System):
             prefix=self._prefix,
             label=self._full.label,
         )
-        self.mark = object()
+        self.coordinate_id = object()
         self.ready = True
         self._full.diagonal = self._full.bulk_diagonal()
         return 1
@@ -138,21 +138,21 @@ class CondensedSystem(System):
         return self._condensation
 
     def state(self) -> Array:
-        """The present values of the unknowns kept; a copy. Collective."""
+        """The present values of the unknowns retained; a copy. Collective."""
         whole = self.unknowns.whole
-        mine = whole.joined(self.u.x.array[self._kept_dofs], self.motions())
+        mine = whole.joined(self.u.x.array[self._retained_dofs], self.motions())
         return self.unknowns.gathered(mine)
 
     def set_state(self, state: Array) -> None:
-        """Set the unknowns kept; the others stay behind until `complete`. Collective."""
+        """Set the unknowns retained; the others stay behind until `complete`. Collective."""
         mine = self.unknowns.scattered(state)
-        self.u.x.array[self._kept_dofs] = mine[: self._kept_dofs.size]
+        self.u.x.array[self._retained_dofs] = mine[: self._retained_dofs.size]
         self.u.x.scatter_forward()
         self.set_motions(state)
 
     def part(self, state: Array) -> Array:
-        """What of a state of all unknowns is kept. Collective."""
-        return self.unknowns.gathered(state[self.unknowns.kept])
+        """What of a state of all unknowns is retained. Collective."""
+        return self.unknowns.gathered(state[self.unknowns.retained])
 
     def begin(self, load: Array) -> None:
         """Condense the load and the values prescribed. Collective."""
@@ -163,7 +163,7 @@ class CondensedSystem(System):
         self.prescribed = self.state()[self.constrained]
         outside = load.copy(), self._full.terms(state)
         for vector in outside:
-            vector[self.unknowns.kept] = 0.0
+            vector[self.unknowns.retained] = 0.0
         self.outside = self._full.by_body(*outside)
 
     def extended(self, change: Array) -> Array:
@@ -172,7 +172,7 @@ class CondensedSystem(System):
 
     @property
     def pending_field(self) -> Array | None:
-        """The displacement that the load makes of the unknowns eliminated, those kept at rest."""
+        """The fixed-interface solution: eliminated displacements with the retained ones at zero."""
         return self.condensation.response.field
 
     def complete(self, field: Array | None) -> None:
@@ -190,7 +190,7 @@ class CondensedSystem(System):
         return float(0.5 * (self.bulk_force() - load) @ self.state())
 
     def forces(self, bulk: Array, reaction: Array) -> Forces:
-        """Forces at the unknowns kept, at the field with these at rest, and at prescribed values.
+        """Forces at the retained unknowns, at the field with these at rest, and prescribed values.
 
         With u = N x + p, p the response to the load, and K symmetric, NᵀK p = -g_u is the part of
         the prescribed values in g, and the products of these forces with differences of these
@@ -250,7 +250,7 @@ class CondensedSystem(System):
         added = np.bincount(rows[on], values[on], minlength=len(fixed))
         self.diagonal = self.bulk_diagonal() + scale * added
         # For the round-off of contact.
-        self._full.diagonal[self.unknowns.kept] = self.unknowns.scattered(self.diagonal)
+        self._full.diagonal[self.unknowns.retained] = self.unknowns.scattered(self.diagonal)
         return 0
 
 

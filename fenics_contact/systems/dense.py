@@ -11,10 +11,10 @@ import numpy as np
 import scipy.linalg
 from petsc4py import PETSc
 
-from fenics_contact.parallel import agreed, collective_errors
+from fenics_contact.parallel import broadcast_from_root, collective_errors
 from fenics_contact.types import Array, Index
 
-__all__ = ["Sum", "UpdatedLU", "raise_kept"]
+__all__ = ["Sum", "UpdatedLU", "raise_stored_error"]
 
 
 # Share of the unknowns up to which a change of C is a correction to the last factors.
@@ -29,7 +29,7 @@ class Sum:
     Attributes:
         fixed: S, (n, n).
         added: Rows, columns and values of C's entries.
-        error: What `mult` ran into: PETSc carries no exception; see `raise_kept`.
+        error: What `mult` ran into: PETSc carries no exception; see `raise_stored_error`.
     """
 
     def __init__(self) -> None:
@@ -98,7 +98,7 @@ class UpdatedLU:
         self._columns, self._answers, self._change = nothing, nothing, nothing
         self._core = nothing, none
 
-    def raise_kept(self) -> None:
+    def raise_stored_error(self) -> None:
         """Raise what this, or the operator, ran into when PETSc called it last."""
         for part in (self, self._operator):
             error, part.error = part.error, None
@@ -118,7 +118,7 @@ class UpdatedLU:
         except BaseException as error:
             self.error, regular = self.error or error, False
             self._factored = None
-        regular = agreed(pc.comm.tompi4py(), regular)
+        regular = broadcast_from_root(pc.comm.tompi4py(), regular)
         pc.setFailedReason(reasons.NOERROR if regular else reasons.FACTOR_NUMERIC_ZEROPIVOT)
 
     def factor_anew(self) -> bool:
@@ -194,7 +194,7 @@ def _factors(matrix: Array) -> tuple[Array, Index]:
         return scipy.linalg.lu_factor(matrix, overwrite_a=True, check_finite=False)
 
 
-def raise_kept(ksp: PETSc.KSP) -> None:
+def raise_stored_error(ksp: PETSc.KSP) -> None:
     """Raise what the contexts of a solver ran into when PETSc called them last, if it has any.
 
     Collective: all ranks raise what one has.
@@ -202,4 +202,4 @@ def raise_kept(ksp: PETSc.KSP) -> None:
     context = ksp.getPC().getPythonContext() if ksp.getPC().getType() == "python" else None
     if isinstance(context, UpdatedLU):
         with collective_errors(ksp.comm.tompi4py()):
-            context.raise_kept()
+            context.raise_stored_error()

@@ -88,7 +88,7 @@ class Eliminated:
         return np.asarray(found)
 
     def release(self) -> Array:
-        """What is left of the others, (n_others, n_others), Fortran order; not kept any more."""
+        """The Schur complement of the others, (n_others, n_others), Fortran order, released."""
         left, self._left = self._left, np.zeros((0, 0))
         return left
 
@@ -264,7 +264,7 @@ class Dissection:
         return others, made.release()
 
     def release(self) -> Array:
-        """`schur`, which is not kept any more."""
+        """`schur`, which is not retained any more."""
         schur, self.schur = self.schur, np.zeros((0, 0))
         return schur
 

@@ -108,7 +108,7 @@ def _pushed(full: FullSystem, motions: RigidBodyModes, bodies: Mask, began: Arra
     least = find_least_motion(full, motions, modes, states, nothing, every)
     full.set_state(present)
     for contact in full.contacts:
-        contact.opposite.update()
+        contact.contact_kinematics.update()
     return motions.size_by_body(nothing if least is None else least)
 
 
@@ -127,7 +127,7 @@ def _moved_opposite(full: FullSystem, change: Array) -> Array:
     found: Array = np.zeros(scales.n_bodies)
     of_bodies = np.where(full.label < scales.n_bodies, change, 0.0)
     for number, operator in enumerate(full.operators):
-        contact, opposite = operator.contact, operator.contact.opposite
+        contact, opposite = operator.contact, operator.contact.contact_kinematics
         length: Array = np.zeros(contact.quadrature.n_points)
         if (points := contact.states.committed.points) is not None:
             bore = (points.normal_traction != 0) & np.isfinite(points.gap)

@@ -36,7 +36,7 @@ class FullSystem(System):
         stiffness: The bulk's tangent over all unknowns, after `update_stiffness`.
     """
 
-    mark: object = "all unknowns"
+    coordinate_id: object = "all unknowns"
     ready = True
 
     def __init__(
@@ -230,7 +230,7 @@ class FullSystem(System):
     @property
     def follows(self) -> bool:
         """Whether pairs of any contact follow the bodies."""
-        return any(contact.opposite.follows for contact in self.contacts)
+        return any(contact.contact_kinematics.follows for contact in self.contacts)
 
     @property
     def pattern_changes(self) -> bool:

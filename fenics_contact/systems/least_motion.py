@@ -14,7 +14,7 @@ import scipy.linalg
 import scipy.optimize
 
 from fenics_contact.contact.values import PointValues
-from fenics_contact.parallel import agreed, gather_rows, global_sum
+from fenics_contact.parallel import broadcast_from_root, gather_rows, global_sum
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.tolerances import FLAT, NEGLIGIBLE, ROUND_OFF
@@ -77,7 +77,7 @@ def find_least_motion(
     turns = motions.free * (motions.turns > 0.0)
     norm = modes @ (mass + _TURNING * mass.max() * turns @ turns.T)
     found = minimise_norm(norm @ modes.T, norm @ displacement, limits[:, :-1], limits[:, -1])
-    found = agreed(comm, found)
+    found = broadcast_from_root(comm, found)
     return None if found is None else np.asarray(found @ modes, dtype=np.float64)
 
 

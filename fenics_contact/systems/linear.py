@@ -25,7 +25,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from fenics_contact.parallel import agreed, global_max, global_min, global_sum
+from fenics_contact.parallel import broadcast_from_root, global_max, global_min, global_sum
 from fenics_contact.systems.modes import rigid_motions
 
 __all__ = [
@@ -221,7 +221,7 @@ def cube_size(space: fem.FunctionSpace, body: npt.NDArray[np.intp]) -> float:
     moments = np.zeros((n_bodies, 4, 4))  # of 1 and x, their products summed up
     np.add.at(moments, body, np.einsum("pi,pj->pij", *[np.insert(x, 0, 1.0, axis=1)] * 2))
     work = 0.0
-    for moment in agreed(comm, global_sum(comm, moments)):
+    for moment in broadcast_from_root(comm, global_sum(comm, moments)):
         count, first = moment[0, 0], moment[0, 1:]
         spread = np.linalg.eigvalsh(moment[1:, 1:] - np.outer(first, first) / count)
         slender = np.sqrt(spread[2] / np.sqrt(spread[0] * spread[1]))
@@ -241,7 +241,7 @@ def near_nullspace(space: fem.FunctionSpace) -> PETSc.NullSpace:
     high = np.array([global_max(comm, column) for column in x.T])
     motions = rigid_motions(x - (low + high) / 2, float(np.linalg.norm(high - low)))
     modes = np.array([motion.ravel() for motion in motions.values()])
-    factor = agreed(comm, np.linalg.cholesky(global_sum(comm, modes @ modes.T)))
+    factor = broadcast_from_root(comm, np.linalg.cholesky(global_sum(comm, modes @ modes.T)))
     modes = np.linalg.solve(factor, modes)
     vectors = []
     for mode in modes:

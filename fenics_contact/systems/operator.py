@@ -21,7 +21,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.point_law import PointTangent
 from fenics_contact.parallel import global_sum
 from fenics_contact.systems.products import PointProduct
-from fenics_contact.systems.unknowns import Selection, Unknowns
+from fenics_contact.systems.unknowns import DofSubset, Unknowns
 from fenics_contact.types import Array, Indices, Mask
 
 __all__ = ["ContactOperator"]
@@ -80,7 +80,7 @@ class ContactOperator:
         With finite kinematics all unknowns that pairs may couple are selected, except round-off of
         functions that are zero on facets.
         """
-        if not isinstance(self.unknowns, Selection) or self.contact.opposite.follows:
+        if not isinstance(self.unknowns, DofSubset) or self.contact.contact_kinematics.follows:
             return None
         pointers, columns, values = self.contact.pairs.jump_map.getValuesCSR()
         row = np.repeat(np.arange(pointers.size - 1), np.diff(pointers))
@@ -116,7 +116,7 @@ class ContactOperator:
     def reachable(self) -> Indices:
         """This rank's unknowns that the contact may couple, now or later. Collective."""
         pairs, displacement = self.contact.pairs, self.contact.displacement
-        if not self.contact.opposite.follows:
+        if not self.contact.contact_kinematics.follows:
             return self.touched
         reach = self.unknowns.widened(displacement.lifted(pairs.reach))
         return self._coupled(reach, np.ones(reach.getLocalSize()[0]))
@@ -168,7 +168,7 @@ class ContactOperator:
                 at the present ``u``, which adds the assembled `Contact.form`.
         """
         if traction is None:
-            traction = self.contact.acting.traction()
+            traction = self.contact.effective_law.traction()
         force = self.contact.area[:, None] * traction
         self._at_points.array[:] = -force.ravel()
         self._map.multTransposeAdd(self._at_points, residual, residual)
@@ -187,8 +187,8 @@ class ContactOperator:
             A new matrix over the unknowns (force/length).
         """
         blocks = self.contact.area[:, None, None] * stiffness
-        follows = self.contact.opposite.follows  # then nothing is worth to be prepared
-        if isinstance(self.unknowns, Selection) and self._turn is None and not follows:
+        follows = self.contact.contact_kinematics.follows  # then nothing is worth to be prepared
+        if isinstance(self.unknowns, DofSubset) and self._turn is None and not follows:
             return self._product(blocks)
         if self._turn is None:
             return self._sandwiched(blocks, self._map)
@@ -206,9 +206,9 @@ class ContactOperator:
         Returns:
             A new matrix over the unknowns (force/length).
         """
-        tangent = tangent or self.contact.acting.tangent()
+        tangent = tangent or self.contact.effective_law.tangent()
         local = self.contact.pairs.local_map
-        if local is not None:  # of pairs that follow the bodies; see `PresentPairs.tangent`
+        if local is not None:  # of pairs that follow the bodies; see `FiniteSlidingPairs.tangent`
             lifted = self.unknowns.widened(self.contact.displacement.lifted(local))
             return self._sandwiched(-self.contact.area[:, None, None] * tangent.by_jump, lifted)
         if tangent.spun is not None and self._turn is not None:
@@ -238,7 +238,9 @@ class ContactOperator:
         Returns:
             (n_points, gdim); zero where a point is not within.
         """
-        arms = np.asarray(self.contact.opposite.turning_rate() / self._length, dtype=np.float64)
+        arms = np.asarray(
+            self.contact.contact_kinematics.turning_rate() / self._length, dtype=np.float64
+        )
         return arms if self.within is None else np.where(self.within[:, None], arms, 0.0)
 
     def _present_map(self, column: int) -> PETSc.Mat:

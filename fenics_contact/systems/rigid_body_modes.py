@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import PointValues, Status
-from fenics_contact.parallel import agreed, global_sum
+from fenics_contact.parallel import broadcast_from_root, global_sum
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.rigid_motions import RigidMotions
@@ -63,7 +63,9 @@ class RigidBodyModes(RigidMotions):
             free.append(_plain((vectors * scale[:, None])[:, values < ROUND_OFF].T))
         self._jumps.clear()
         # Motions of obstacles have no bulk energy.
-        self.free = agreed(self.comm, scipy.linalg.block_diag(*free, np.eye(n_obstacles)))
+        self.free = broadcast_from_root(
+            self.comm, scipy.linalg.block_diag(*free, np.eye(n_obstacles))
+        )
         self._scales.held = np.all(~np.hstack(self._moved()), axis=0)
         for vector in (work, image):
             vector.destroy()
@@ -114,7 +116,7 @@ class RigidBodyModes(RigidMotions):
         off = np.abs(found @ self.free - modes).max(axis=1)
         _, sizes, basis = np.linalg.svd(found[off <= FLAT * np.abs(modes).max(axis=1)])
         rank = np.count_nonzero(sizes > NEGLIGIBLE * sizes.max(initial=0.0))
-        return agreed(self.comm, np.asarray(basis[:rank], dtype=np.float64))
+        return broadcast_from_root(self.comm, np.asarray(basis[:rank], dtype=np.float64))
 
     def move_any(self, modes: Array, bodies: Mask) -> Mask:
         """Which modes move some of these bodies, (n_modes,).
@@ -172,7 +174,7 @@ class RigidBodyModes(RigidMotions):
         fields = np.array([part(field) for field in self.present_fields()])
         sums = global_sum(self.comm, np.column_stack([fields @ fields.T, fields @ part(change)]))
         found = np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=NEGLIGIBLE)[0]
-        return np.asarray(agreed(self.comm, found), dtype=np.float64)
+        return np.asarray(broadcast_from_root(self.comm, found), dtype=np.float64)
 
     def displacement(self, coefficients: Array) -> Array:
         """By how much unknowns change as free motions go on from here, (n_local,).
@@ -313,7 +315,7 @@ class RigidBodyModes(RigidMotions):
             found = np.zeros((np.count_nonzero(sizes < least), n))
             found[:, mine] = (vectors * scale[mine, None])[:, sizes < least].T
             loose.append(found)
-        return agreed(self.comm, np.concatenate(loose))
+        return broadcast_from_root(self.comm, np.concatenate(loose))
 
     def straight(self) -> Index:
         """Numbers of the free motions but for those by which obstacles turn."""
@@ -394,7 +396,7 @@ def _slip(contact: Contact, values: PointValues) -> Array:
     """
     size = np.linalg.norm(values.traction, axis=1)
     slips = values.slips & (size > 0) & contact.law.has_friction
-    slips &= not contact.acting.own.bound_depends_on_motion
+    slips &= not contact.effective_law.own.bound_depends_on_motion
     way = values.traction * (slips / np.where(slips, size, 1.0))[:, None]
     return np.asarray(way, dtype=np.float64)
 

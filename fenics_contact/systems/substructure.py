@@ -93,7 +93,7 @@ class Substructure:
         return array
 
     def release(self) -> Array:
-        """`schur`, which is not kept any more."""
+        """`schur`, which is not retained any more."""
         schur, self.schur = self.schur, np.zeros((0, 0))
         return schur
 

@@ -51,12 +51,12 @@ class System(ABC):
         n_bodies: Their number.
         scales: Reference scales of the bodies.
         linear_kind: How linear systems are solved, one of `linear.KINDS`.
-        mark: Of the coordinates that `forces` are in.
+        coordinate_id: Of the coordinates that `forces` are in.
         ready: Whether `fill` can be called; else `update` comes first.
     """
 
     linear_kind = "direct"
-    mark: object
+    coordinate_id: object
     ready: bool
     scales: ReferenceScales
 
@@ -102,8 +102,8 @@ class System(ABC):
         are others than before gets another operator, and it alone: no operator changes.
         """
         for contact in self.contacts:
-            if contact.opposite.follows:
-                contact.opposite.update()
+            if contact.contact_kinematics.follows:
+                contact.contact_kinematics.update()
         for i, contact in enumerate(self.contacts):
             number = contact.pairs.number
             if i not in self._operators or self._operators[i][0] != number:
@@ -191,7 +191,7 @@ class System(ABC):
         return any(operator.within is not None for operator in self.operators)
 
     @contextmanager
-    def acting(self) -> Iterator[None]:
+    def restricted_contacts(self) -> Iterator[None]:
         """Confine the contacts to what the system has of Γc inside of the block. Collective.
 
         What the others feel is not known before `complete`.
@@ -199,11 +199,11 @@ class System(ABC):
         confined = [o for o in self.operators if o.within is not None]
         try:
             for operator in confined:
-                operator.contact.confine(operator.within)
+                operator.contact.restrict_to(operator.within)
             yield
         finally:
             for operator in confined:
-                operator.contact.confine()
+                operator.contact.restrict_to()
 
     # ---- states ----------------------------------------------------------------------------------
 
@@ -255,7 +255,7 @@ class System(ABC):
         A turn further its points are where they were: to a solution there are others.
         """
         turns = (
-            float(contact.free_angle.value) - contact.opposite.committed_angle
+            float(contact.free_angle.value) - contact.contact_kinematics.committed_angle
             for contact in self.contacts
             if contact.free_angle is not None
         )
@@ -302,7 +302,7 @@ class System(ABC):
 
     @abstractmethod
     def forces(self, bulk: Array, reaction: Array) -> Forces:
-        """For the energies: forces at the present state, in the coordinates of ``mark``.
+        """For the energies: forces at the present state, in the coordinates of ``coordinate_id``.
 
         Args:
             bulk: Residual of the bulk, (n,) (force).
@@ -320,7 +320,7 @@ class System(ABC):
 
     @abstractmethod
     def forget(self) -> None:
-        """Drop what was kept of earlier increments and could show in the digits of the next."""
+        """Drop what was retained of earlier increments and could show in the digits of the next."""
 
     @abstractmethod
     def bulk_force(self) -> Array:

@@ -14,7 +14,7 @@ from petsc4py import PETSc
 from fenics_contact.compat import sparse_matrix
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["Selection", "Unknowns"]
+__all__ = ["DofSubset", "Unknowns"]
 
 
 class Unknowns:
@@ -28,8 +28,8 @@ class Unknowns:
         first: Global number of the first one of this rank.
         first_motion: Global number of the first motion.
         motions_on: The rank that has them.
-        whole: All unknowns, of which these may be a `Selection`.
-        kept: Numbers of these among this rank's share of all, ascending.
+        whole: All unknowns, of which these may be a `DofSubset`.
+        retained: Numbers of these among this rank's share of all, ascending.
     """
 
     def __init__(self, space: fem.FunctionSpace, n_motions: int = 0) -> None:
@@ -44,7 +44,7 @@ class Unknowns:
         self.first = dofmap.index_map.local_range[0] * dofmap.index_map_bs
         self.first_motion = dofmap.index_map.size_global * dofmap.index_map_bs
         self.n_global = self.first_motion + n_motions
-        self.kept: npt.NDArray[np.int32] = np.arange(self.n_local, dtype=np.int32)
+        self.retained: npt.NDArray[np.int32] = np.arange(self.n_local, dtype=np.int32)
 
     def vector(self) -> PETSc.Vec:
         """A new vector over the unknowns. Collective."""
@@ -62,9 +62,9 @@ class Unknowns:
         return np.asarray(self.comm.bcast(mine, root=self.motions_on), dtype=np.float64)
 
     def gathered(self, values: Array) -> Array:
-        """Of values at the unknowns `kept` on every rank those at this rank's unknowns. Collective.
+        """Values at this rank's unknowns, of those at `retained` on every rank. Collective.
 
-        The same, but for a `Selection`.
+        The same, but for a `DofSubset`.
         """
         return values
 
@@ -94,22 +94,22 @@ class Unknowns:
         return sparse_matrix(self.comm, self.n_local, pointers, columns, values)
 
 
-class Selection(Unknowns):
+class DofSubset(Unknowns):
     """Some of the dofs and all of the motions, all of them on the first rank.
 
     The constructor is collective.
 
     Args:
         whole: All unknowns.
-        kept: Numbers of the dofs and motions among this rank's, ascending.
+        retained: Numbers of the dofs and motions among this rank's, ascending.
 
     Attributes are those of `Unknowns`, and
         numbers: Of these unknowns among all of all ranks, ascending; the same on every rank.
     """
 
-    def __init__(self, whole: Unknowns, kept: npt.NDArray[np.int32]) -> None:
-        self.whole, self.kept, self.comm = whole, kept, whole.comm
-        shares = self.comm.allgather(whole.first + kept.astype(np.int64))
+    def __init__(self, whole: Unknowns, retained: npt.NDArray[np.int32]) -> None:
+        self.whole, self.retained, self.comm = whole, retained, whole.comm
+        shares = self.comm.allgather(whole.first + retained.astype(np.int64))
         self._counts = [share.size for share in shares]
         self.numbers: npt.NDArray[np.int64] = np.concatenate(shares)
         self.first = 0
@@ -133,7 +133,7 @@ class Selection(Unknowns):
         """See `Unknowns.scattered`: to the ranks whose they are."""
         if self.comm.size == 1:
             return values
-        result = np.zeros(self.kept.size)
+        result = np.zeros(self.retained.size)
         self.comm.Scatterv((np.ascontiguousarray(values, dtype=np.float64), self._counts), result)
         return result
 

@@ -24,10 +24,10 @@ from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.methods.limit_analysis import CLEARLY
-from fenics_contact.methods.method import OwnMethod, SnesMethod, Tools
+from fenics_contact.methods.method import SnesMethod, SolverContext, StandaloneMethod
 from fenics_contact.types import Array
 
-__all__ = ["Alternation"]
+__all__ = ["TrescaFixedPoint"]
 
 logger = logging.getLogger("fenics_contact")
 
@@ -66,17 +66,17 @@ _STILL = 1e-6
 _REASONS = PETSc.SNES.ConvergedReason
 
 
-class Alternation(OwnMethod):
+class TrescaFixedPoint(StandaloneMethod):
     """The method.
 
     Attributes:
         snes: Newton's method for the subproblems, prefix "alternating_" behind the problem's.
     """
 
-    def __init__(self, tools: Tools) -> None:
-        self._equations = tools.equations
-        self._search = _Search(tools, "alternating_", _OPTIONS)
-        self._finish = _Minimisation(tools, "finishing_", _FINISH)
+    def __init__(self, context: SolverContext) -> None:
+        self._equations = context.equations
+        self._search = _Search(context, "alternating_", _OPTIONS)
+        self._finish = _Minimisation(context, "finishing_", _FINISH)
         self.snes = self._search.snes
 
     def solve(self) -> tuple[int, int]:
@@ -106,7 +106,7 @@ class Alternation(OwnMethod):
                     bound = _MORE * needed * bound
                 ends = np.cumsum([c.quadrature.n_points for c in equations.contacts])[:-1]
                 for contact, part in zip(equations.contacts, np.split(bound, ends), strict=True):
-                    contact.acting.fix_friction_bound(part)
+                    contact.effective_law.fix_friction_bound(part)
                 share = 0.0 if equations.has_potential else _INNER
                 self._search.goal = self._finish.goal = share * residual
                 iterations += self._minimise()
@@ -127,10 +127,10 @@ class Alternation(OwnMethod):
         finally:
             equations.h0_is_made = False
             for contact in equations.contacts:
-                contact.acting.release_friction_bound()
+                contact.effective_law.release_friction_bound()
 
     def check(self) -> None:
-        """See `OwnMethod.check`: minimum problems, all of which have energies to be lowered."""
+        """Refuse problems without a potential: this method minimises energies."""
         if self._equations.full.displacement.mixed:
             raise ValueError(
                 "method is 'alternating', but u is a part of a mixed function, whose equations are "
@@ -149,12 +149,12 @@ class Alternation(OwnMethod):
 
     @property
     def suits(self) -> bool:
-        """See `OwnMethod.suits`."""
+        """See `StandaloneMethod.suits`."""
         mixed = self._equations.full.displacement.mixed
         return bool(self._equations.contacts) and not mixed and not self._without_potential()
 
     def _without_potential(self) -> list[Contact]:
-        return [c for c in self._equations.contacts if not c.acting.can_fix_friction_bound]
+        return [c for c in self._equations.contacts if not c.effective_law.can_fix_friction_bound]
 
     def _friction_bound(self) -> Array:
         """Friction bound of all contacts at this rank's points (stress)."""
@@ -166,7 +166,7 @@ class Alternation(OwnMethod):
         """That of the whole law."""
         equations = self._equations
         for contact in equations.contacts:
-            contact.acting.release_friction_bound()
+            contact.effective_law.release_friction_bound()
         return float(equations.residual(equations.solution, equations.function).total)
 
     def _minimise(self) -> int:
@@ -184,7 +184,7 @@ class _Minimisation(SnesMethod):
     The constructor is collective.
 
     Args:
-        tools: What it is made of.
+        context: What it is made of.
         part: What follows the prefix of the problem's options in that of this one.
         options: Those of SNES.
 
@@ -192,9 +192,9 @@ class _Minimisation(SnesMethod):
         goal: Residual to which the present one is solved (force).
     """
 
-    def __init__(self, tools: Tools, part: str, options: Mapping[str, Any]) -> None:
-        snes, own = tools.snes(part, options, consistent=False)
-        super().__init__(tools.equations, snes, lambda: False, own_solver=own)
+    def __init__(self, context: SolverContext, part: str, options: Mapping[str, Any]) -> None:
+        snes, own = context.snes(part, options, consistent=False)
+        super().__init__(context.equations, snes, lambda: False, own_solver=own)
         self.goal = 0.0
 
     def converged(self) -> int:
@@ -219,8 +219,8 @@ class _Minimisation(SnesMethod):
 class _Search(_Minimisation):
     """The same with a line search on the energy, where the bulk has one."""
 
-    def __init__(self, tools: Tools, part: str, options: Mapping[str, Any]) -> None:
-        super().__init__(tools, part, options)
+    def __init__(self, context: SolverContext, part: str, options: Mapping[str, Any]) -> None:
+        super().__init__(context, part, options)
         # Potential at the state asked for last, and where it was last found to have fallen.
         self._energy = self._reached = np.inf
 

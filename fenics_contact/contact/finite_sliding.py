@@ -29,8 +29,8 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact.compat import sparse_matrix
-from fenics_contact.contact.kinematics import Seen, tangential
 from fenics_contact.contact.pairs import Pairs, PairsState
+from fenics_contact.contact.point_geometry import PointGeometry, tangential
 from fenics_contact.contact.values import PointValues
 from fenics_contact.laws.base import Law, PointKinematics
 from fenics_contact.obstacles.deformable import DeformableBody
@@ -41,7 +41,7 @@ from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Mask
 
-__all__ = ["PresentKinematics", "PresentPairs"]
+__all__ = ["FiniteSlidingKinematics", "FiniteSlidingPairs"]
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class _Present:
     stretch: Array
 
 
-class PresentPairs(Pairs):
+class FiniteSlidingPairs(Pairs):
     """Pairs that follow the bodies: found anew wherever the displacement has changed.
 
     The constructor is collective, and collects the surfaces; `follow` finds the pairs.
@@ -100,7 +100,7 @@ class PresentPairs(Pairs):
         self._rays = self.search.rays
         d = self._gdim
         self._before = u.copy()
-        self.felt = PointFields(quadrature, {"gap": 0, "normal": d, "slip": d, "traction": d})
+        self.local_jump = PointFields(quadrature, {"gap": 0, "normal": d, "slip": d, "traction": d})
         self._where: tuple[Array, Array] | None = None
         self._at_rest: tuple[Array, Array] | None = None
         self._committed: _Committed | None = None
@@ -180,7 +180,7 @@ class PresentPairs(Pairs):
             slip = self.turned(now.way - history.values("jump"))
             start = self.turned(traction.values("traction"))
         values = {"gap": now.gap, "normal": now.normal, "slip": slip, "traction": start}
-        self.felt.assign(values)
+        self.local_jump.assign(values)
 
     @cached_property
     def reach(self) -> PETSc.Mat:
@@ -230,12 +230,12 @@ class PresentPairs(Pairs):
 
     @property
     def undeformed_gap(self) -> Array:
-        """See `Opposite.undeformed_gap`."""
+        """See `ContactKinematics.undeformed_gap`."""
         assert self._at_rest is not None
         return self._at_rest[0]
 
     def true_gap(self, values: PointValues) -> tuple[Array, Array]:
-        """See `Opposite.true_placement`: it is that of the pairs themselves."""
+        """See `ContactKinematics.true_placement`: it is that of the pairs themselves."""
         return np.where(self.paired, values.gap, np.nan), values.normal.copy()
 
     # ---- derivatives -----------------------------------------------------------------------------
@@ -302,7 +302,7 @@ class PresentPairs(Pairs):
         parts = [gap[:, None], normal]
         if "traction" in history:
             ways = now.way - history.values("jump")
-            started = np.einsum("qji,qj->qi", now.rotation, self.felt.values("traction"))
+            started = np.einsum("qji,qj->qi", now.rotation, self.local_jump.values("traction"))
             turns = self._spin(normal, slopes)
             for vector, change in ((ways, way), (started, np.zeros_like(way))):
                 moved = change + _crossed(turns, vector)
@@ -343,8 +343,8 @@ class PresentPairs(Pairs):
 
 
 @dataclass(frozen=True)
-class PresentKinematics:
-    """Numbers of `PresentPairs` stand for all that bodies do.
+class FiniteSlidingKinematics:
+    """Numbers of `FiniteSlidingPairs` stand for all that bodies do.
 
     Attributes:
         multipliers: λ_n and λ_t, which take the place of committed tractions.
@@ -352,9 +352,9 @@ class PresentKinematics:
 
     multipliers: PointFields | None
 
-    def __call__(self, jump: Any, law: Law, seen: Seen) -> PointKinematics:
-        """What a law sees of `PresentPairs.felt` (UFL)."""
-        d = len(seen.normal)
+    def __call__(self, jump: Any, law: Law, geometry: PointGeometry) -> PointKinematics:
+        """What a law sees of `FiniteSlidingPairs.local_jump` (UFL)."""
+        d = len(geometry.normal)
         normal, slip, start = (
             ufl.as_vector([jump[1 + part * d + i] for i in range(d)]) for part in range(3)
         )

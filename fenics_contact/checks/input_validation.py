@@ -195,7 +195,7 @@ def check_start(contacts: Sequence[Contact]) -> float:
         contact.check_input()
         _refuse_enclosed(contact)
         contact.inputs.check_side(contact.values, gap_prescribed=contact.gap_prescribed)
-        gap = global_min(comm, contact.opposite.undeformed_gap(contact.values))
+        gap = global_min(comm, contact.contact_kinematics.undeformed_gap(contact.values))
         if gap < -ROUND_OFF * extent and not contact.gap_prescribed:
             worst = max(worst, -gap)
             if comm.rank == 0:
@@ -216,12 +216,12 @@ def _refuse_enclosed(contact: Contact) -> None:
     Raises:
         ValueError: On all ranks.
     """
-    if contact.opposite.sampler is None:
+    if contact.contact_kinematics.sampler is None:
         return
     mesh, values, places = contact.surface.mesh, contact.values, contact.facet_places
     comm, facets = mesh.comm, places.facets
     # Paths are followed from where the obstacle has not been displaced.
-    gap, normal = contact.opposite.sampler.sample(values.x)
+    gap, normal = contact.contact_kinematics.sampler.sample(values.x)
     # Points of the obstacle's surface, and by round-off inside of it.
     smallest = global_min(comm, contact.quadrature.facet_sizes, empty=np.inf)
     inside = _COORDINATE_ROUND_OFF * smallest
@@ -308,7 +308,7 @@ def _n_doubled(one: Contact, other: Contact) -> int:
     for contact, rows in zip((one, other), shared, strict=True):
         points, values = contact.quadrature.point_rows[rows], contact.values
         # Means, as rules may differ, and the order of points on a facet does.
-        gap = contact.opposite.undeformed_gap(values)
+        gap = contact.contact_kinematics.undeformed_gap(values)
         places.append([a[points].mean(axis=1) for a in (gap, values.normal)])
         facing &= np.all(values.paired[points], axis=1)
     gaps, normals = (np.abs(a - b) for a, b in zip(*places, strict=True))

@@ -15,11 +15,11 @@ import ufl
 from fenics_contact.laws.base import Law, PointKinematics
 from fenics_contact.surface.fields import PointFields
 
-__all__ = ["Kinematics", "Seen", "SmallKinematics", "tangential"]
+__all__ = ["LocalKinematics", "PointGeometry", "SmallKinematics", "tangential"]
 
 
 @dataclass(frozen=True)
-class Seen:
+class PointGeometry:
     """What a law sees of a point apart from displacements (UFL).
 
     Attributes:
@@ -40,7 +40,7 @@ class Seen:
 
 
 # What a law sees of a displacement of the body relative to what lies opposite (all UFL).
-Kinematics: TypeAlias = Callable[[Any, Law, Seen], PointKinematics]
+LocalKinematics: TypeAlias = Callable[[Any, Law, PointGeometry], PointKinematics]
 
 
 @dataclass(frozen=True)
@@ -55,20 +55,20 @@ class SmallKinematics:
     history: PointFields
     multipliers: PointFields | None
 
-    def __call__(self, jump: Any, law: Law, seen: Seen) -> PointKinematics:
+    def __call__(self, jump: Any, law: Law, geometry: PointGeometry) -> PointKinematics:
         """What a law sees of a displacement of the body, relative to what lies opposite (UFL)."""
-        normal = seen.normal
+        normal = geometry.normal
         total = increment = traction = multiplier = None
         if self.multipliers is not None:
             multiplier = self.multipliers.ufl("pressure")
         if law.has_tangential:
-            total = tangential(seen.relative(jump), normal)
+            total = tangential(geometry.relative(jump), normal)
         if law.has_friction:
             # The old traction and displacement are taken along the present normal: the obstacle
             # may have moved on since the last commit.
-            increment = tangential(seen.relative(jump) - self.history.ufl("jump"), normal)
+            increment = tangential(geometry.relative(jump) - self.history.ufl("jump"), normal)
             traction = tangential((self.multipliers or self.history).ufl("traction"), normal)
-        gap = seen.gap - ufl.dot(jump, normal)
+        gap = geometry.gap - ufl.dot(jump, normal)
         return PointKinematics(gap, normal, total, increment, traction, multiplier)
 
 

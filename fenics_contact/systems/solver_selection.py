@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fenics_contact.systems import linear
-from fenics_contact.systems.candidates import touched
-from fenics_contact.systems.condensed import all_kept, worthwhile
+from fenics_contact.systems.candidate_dofs import touched
+from fenics_contact.systems.condensed import all_retained, worthwhile
 from fenics_contact.systems.full import FullSystem
 
 __all__ = ["linear_kind", "reason_not_to_condense"]
@@ -19,7 +19,7 @@ def reason_not_to_condense(
     linear_solver: str | None,
     named: Sequence[str],
     increments: int,
-    n_kept: int,
+    n_retained: int,
 ) -> str | None:
     """Why not to iterate on the unknowns that contact touches alone; None: do. Collective.
 
@@ -29,7 +29,7 @@ def reason_not_to_condense(
         linear_solver: What the caller wants for systems over all unknowns.
         named: Options given that name a linear solver, which the dense one cannot be.
         increments: How many of them are expected.
-        n_kept: How many unknowns there would be.
+        n_retained: How many unknowns there would be.
 
     Raises:
         ValueError: It is wanted and cannot be had.
@@ -44,7 +44,7 @@ def reason_not_to_condense(
         obstacle = "the displacement is a part of a mixed function"
     elif full.follows and not full.scales.held.all():
         obstacle = "bodies with finite kinematics are constrained by contact only"
-    elif full.follows and not all_kept(unknowns.n_global, _n_touched(full), gdim):
+    elif full.follows and not all_retained(unknowns.n_global, _n_touched(full), gdim):
         obstacle = "finite kinematics couple more dofs than can be retained"
     elif named:
         obstacle = f"the options name a linear solver ({', '.join(named)})"
@@ -59,8 +59,8 @@ def reason_not_to_condense(
     if wanted or obstacle:
         return obstacle
     n = unknowns.n_global
-    if n_kept == n or not worthwhile(n, n_kept, gdim):
-        return f"contact couples {n_kept} of {n} unknowns, too many for it to save time"
+    if n_retained == n or not worthwhile(n, n_retained, gdim):
+        return f"contact couples {n_retained} of {n} unknowns, too many for it to save time"
     if unknowns.n_motions or linear_solver is not None:
         return None
     n_bytes = linear.factor_bytes(n, gdim, symmetric=full.bulk.symmetric)

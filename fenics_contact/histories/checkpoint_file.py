@@ -15,7 +15,7 @@ import numpy as np
 from fenics_contact.results import files
 from fenics_contact.types import Array
 
-__all__ = ["FORMAT", "Stored", "check_finite", "read_file", "refuse", "write_file"]
+__all__ = ["FORMAT", "StoredCheckpoint", "check_finite", "read_file", "refuse", "write_file"]
 
 FORMAT = 9
 # The file's end: these words, and the digest of all before them.
@@ -24,7 +24,7 @@ _REMEDY = "remove it to start again"
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredCheckpoint:
     """The content of a checkpoint file, on every rank.
 
     Attributes:
@@ -55,7 +55,7 @@ def write_file(path: Path, scene: dict[str, Any], arrays: dict[str, Array]) -> N
         OSError: It cannot be written, or is not what was written. The file before it stays.
     """
     content = _pack(scene, arrays)
-    with files.replacing(path) as temporary:
+    with files.atomic_write(path) as temporary:
         with open(temporary, "wb") as file:
             file.write(content)
         # Whether it can be gone on from is better known now than when it is needed.
@@ -129,7 +129,7 @@ def check_finite(name: str, array: Array, where: str) -> None:
         raise ValueError(f"{name!r} has values that are not finite: {where}")
 
 
-def refuse(stored: Stored, differences: Sequence[str], remedy: str = "") -> None:
+def refuse(stored: StoredCheckpoint, differences: Sequence[str], remedy: str = "") -> None:
     """Refuse a file that differs from what is wanted.
 
     Raises:

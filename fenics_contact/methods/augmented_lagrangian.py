@@ -12,10 +12,10 @@ from fenics_contact.methods.acceleration import Acceleration
 from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.equations import Equations
 from fenics_contact.parallel import global_sum
-from fenics_contact.systems.answered import leave_out_unanswered
+from fenics_contact.systems.multiplier_projection import project_multiplier_updates
 from fenics_contact.types import Array
 
-__all__ = ["INNER", "solve_in_rounds"]
+__all__ = ["INNER", "solve_augmented_lagrangian"]
 
 logger = logging.getLogger("fenics_contact")
 
@@ -32,7 +32,7 @@ _SURELY = 0.1
 _FELL, _NOTHING = 0.2, 1e-10
 
 
-def solve_in_rounds(
+def solve_augmented_lagrangian(
     equations: Equations,
     iterate: Callable[[bool], tuple[int, list[Attempt]]],
     load_before: Array,
@@ -70,7 +70,7 @@ def solve_in_rounds(
             for operator in equations.full.operators:
                 if operator.contact in augmented:
                     operator.contact.evaluate()
-                    leave_out_unanswered(
+                    project_multiplier_updates(
                         operator, equations.full.state(), equations.full.constrained
                     )
             errors = [c.enforcement_error() for c in augmented]
@@ -79,7 +79,7 @@ def solve_in_rounds(
             # Given displacements squeeze a body the less the softer the springs are, and there is
             # less friction: an overload is none before the multipliers bear what springs cannot.
             # Soft ones take over no more in a round than their stiffness by the bulk's of the rest.
-            share = min(1.0, equations.hardness()) if overload else 1.0
+            share = min(1.0, equations.stiffness_ratio()) if overload else 1.0
             if overload is not None:
                 grows = max(errors) / share
                 if grows < _SURELY * (overload.factor - 1.0) < np.inf:

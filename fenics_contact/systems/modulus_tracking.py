@@ -11,10 +11,10 @@ from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.modulus import cell_modulus
 from fenics_contact.systems.bulk import Bulk
 
-__all__ = ["FollowedModulus"]
+__all__ = ["TrackedModulus"]
 
 
-class FollowedModulus:
+class TrackedModulus:
     """E as it was measured last; contacts to which it was given by their caller are left alone.
 
     The constructor is collective.

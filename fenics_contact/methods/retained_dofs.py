@@ -1,4 +1,4 @@
-"""Which unknowns are kept where a problem is condensed: those that contact may touch."""
+"""Which unknowns are retained where a problem is condensed: those that contact may touch."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fenics_contact.systems.candidates import acting, distances, nearest, touched
-from fenics_contact.systems.condensed import all_kept, inexpensive, worthwhile
+from fenics_contact.systems.candidate_dofs import active_points, distances, nearest, touched
+from fenics_contact.systems.condensed import all_retained, inexpensive, worthwhile
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Indices
 
-__all__ = ["Kept"]
+__all__ = ["RetainedDofs"]
 
 
-# What is kept grows by this factor, lest it grows often.
+# What is retained grows by this factor, lest it grows often.
 _GROWTH = 2
 
 
-class Kept:
-    """The unknowns that are kept.
+class RetainedDofs:
+    """The unknowns that are retained.
 
     All that contact touches, if that is little; else those where bodies are nearest to each other,
     and more where it turns out that contact spreads beyond them. The constructor is collective.
@@ -39,7 +39,8 @@ class Kept:
         self._full, self._all_that_pay = full, all_that_pay
         self.indices = self._nearest()
         self.chosen = False
-        # For `change`: those to be kept, or how far points of the last solution were from bearing.
+        # For `change`: the dofs to retain, or the distances of the last solution's points from
+        # contact.
         self._next: Indices | None = None
         self._away: list[Array] | None = None
 
@@ -50,7 +51,7 @@ class Kept:
 
     @property
     def is_all(self) -> bool:
-        """Whether contact touches so little now that all of it is kept. Collective."""
+        """Whether contact touches so little now that all of it is retained. Collective."""
         return self._is_little(self.touched())
 
     def touched(self) -> Indices:
@@ -61,7 +62,7 @@ class Kept:
         return int(self._full.unknowns.comm.allreduce(indices.size))
 
     def _is_little(self, everything: Indices) -> bool:
-        return all_kept(self._full.unknowns.n_global, self._count(everything), self._full.gdim)
+        return all_retained(self._full.unknowns.n_global, self._count(everything), self._full.gdim)
 
     def _nearest(self, at_least: int = 0, away: Sequence[Array] | None = None) -> Indices:
         """Unknowns to keep: where bodies are nearest to each other. Collective.
@@ -86,31 +87,31 @@ class Kept:
         )
 
     def _grown(self, away: Sequence[Array] | None, *, anew: bool) -> Indices:
-        """More unknowns than are kept now. Collective.
+        """More unknowns than are retained now. Collective.
 
-        Contact that travels comes back, and all that was kept is so for as long as it pays.
+        Contact that travels comes back, and all that was retained is so for as long as it pays.
 
         Args:
             away: See `_nearest`.
-            anew: Whether those kept now may be dropped where they would be too many.
+            anew: Whether those retained now may be dropped where they would be too many.
         """
         before, n = self.indices, self.count
-        kept = before
+        retained = before
         for at_least in (_GROWTH * n, 0):
-            kept = np.union1d(before, self._nearest(at_least, away)).astype(np.int32)
-            if self._count(kept) == n:
-                kept = self.touched()
-            if self._all_that_pay or self._pays(kept):
-                return kept
-        return self._nearest(0, away) if anew else kept
+            retained = np.union1d(before, self._nearest(at_least, away)).astype(np.int32)
+            if self._count(retained) == n:
+                retained = self.touched()
+            if self._all_that_pay or self._pays(retained):
+                return retained
+        return self._nearest(0, away) if anew else retained
 
-    def _pays(self, kept: Indices) -> bool:
-        return worthwhile(self._full.unknowns.n_global, self._count(kept), self._full.gdim)
+    def _pays(self, retained: Indices) -> bool:
+        return worthwhile(self._full.unknowns.n_global, self._count(retained), self._full.gdim)
 
     def grows(self) -> bool:
         """Keep all that contact touches with other pairs, if that is little. Collective.
 
-        A body that slides comes back to places where it was: what is kept grows only.
+        A body that slides comes back to places where it was: what is retained grows only.
 
         Returns:
             Whether it has grown.
@@ -122,11 +123,11 @@ class Kept:
         self.indices = np.union1d(self.indices, everything).astype(np.int32)
         return self.count > n
 
-    def chooses(self, *, other_pairs: bool) -> bool:
+    def select_dofs(self, *, other_pairs: bool) -> bool:
         """Whether an increment that starts here takes other unknowns; then `change`. Collective.
 
         Args:
-            other_pairs: Whether points have other opposites than those kept are of.
+            other_pairs: Whether points have other opposites than those retained are of.
         """
         comm = self._full.unknowns.comm
         self._next = None
@@ -135,31 +136,31 @@ class Kept:
             if comm.allreduce(int(not np.array_equal(found, self.indices))):
                 self._next = found
         elif other_pairs and not self.is_all:
-            bearing = [acting(contact) for contact in self._full.contacts]
+            bearing = [active_points(contact) for contact in self._full.contacts]
             needed = touched(self._full.operators, self._full.unknowns, bearing)
             if comm.allreduce(np.setdiff1d(needed, self.indices).size):
                 self._next = self._grown(None, anew=True)
         return self._next is not None
 
-    def misses(self, operators: Sequence[ContactOperator], *, found: bool) -> bool:
-        """Whether contact acts on more unknowns than are kept. Collective.
+    def needs_more_dofs(self, operators: Sequence[ContactOperator], *, found: bool) -> bool:
+        """Whether contact acts on more unknowns than are retained. Collective.
 
         Args:
-            operators: Contacts over those kept.
+            operators: Contacts over those retained.
             found: Whether there is a solution; if so contacts are evaluated on all of Γc.
         """
         outside = False
         for operator in operators:
             if operator.within is not None:
-                outside |= bool(np.any(acting(operator.contact) & ~operator.within))
+                outside |= bool(np.any(active_points(operator.contact) & ~operator.within))
         self._next = None
         self._away = [distances(c) for c in self._full.contacts] if found else None
         return bool(self._full.unknowns.comm.allreduce(int(outside)))
 
     def change(self, *, anew: bool) -> None:
-        """Keep what `chooses` or `misses` found to be needed. Collective.
+        """Keep what `select_dofs` or `needs_more_dofs` found to be needed. Collective.
 
         Args:
-            anew: Whether those kept now may be dropped where they would be too many.
+            anew: Whether those retained now may be dropped where they would be too many.
         """
         self.indices = self._grown(self._away, anew=anew) if self._next is None else self._next

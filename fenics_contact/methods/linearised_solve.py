@@ -59,7 +59,7 @@ def linearised(
         right.scale(-1.0 / system.bulk.scale)
         with interrupts_held():
             ksp.solve(right, left)
-        dense.raise_kept(ksp)
+        dense.raise_stored_error(ksp)
         if ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
             raise ValueError(
                 "the linearised equations are singular at this state: a body or a free obstacle is "
@@ -126,7 +126,7 @@ def respond(
         ksp.getPC().setPythonContext(_Nearby(equations.solvers[consistent]))
         ksp.setTolerances(rtol=_NEARBY, max_it=100)
         ksp.solve(right, left)
-        dense.raise_kept(equations.solvers[consistent])
+        dense.raise_stored_error(equations.solvers[consistent])
         if ksp.getResidualNorm() > _ROUGHLY * right.norm():
             left.set(np.nan)  # nothing is known
         return [operator.jump(left.array_r) for operator in system.operators]

@@ -2,8 +2,8 @@
 
 |                     | a rigid obstacle (`rigid`) | another body (`body`) |
 |---------------------|---------------------------|-----------------------|
-| small displacements | `RigidOpposite`           | `BodyOpposite`        |
-| finite ones         | `MovingOpposite`          | `FollowedOpposite`    |
+| small displacements | `RigidSmall`           | `BodySmall`        |
+| finite ones         | `RigidFinite`          | `BodyFinite`    |
 
 Each samples at the points of Γc what laws are functions of there, and keeps what was committed of
 it: the jump, the angle, the pairs.
@@ -22,10 +22,10 @@ import ufl
 from dolfinx import fem
 
 from fenics_contact.contact.inputs import Inputs, check_given
-from fenics_contact.contact.kinematics import Kinematics, Seen, SmallKinematics
 from fenics_contact.contact.obstacle_sampler import ObstacleSampler
 from fenics_contact.contact.pairs import Pairs, PairsState
 from fenics_contact.contact.point_data import PointData
+from fenics_contact.contact.point_geometry import LocalKinematics, PointGeometry, SmallKinematics
 from fenics_contact.contact.point_law import PointLaw, PointTangent
 from fenics_contact.contact.sampled import SampledPlaces
 from fenics_contact.contact.values import PointValues
@@ -37,11 +37,17 @@ from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.types import Array, Mask
 
-__all__ = ["IncrementalRotation", "ObstacleMotion", "Opposite", "OppositeState", "Parts"]
+__all__ = [
+    "ContactKinematics",
+    "ContactParts",
+    "IncrementalRotation",
+    "KinematicsState",
+    "ObstacleMotion",
+]
 
 
 @dataclass(frozen=True)
-class Parts:
+class ContactParts:
     """What a contact consists of; see there."""
 
     name: str
@@ -65,8 +71,8 @@ class Parts:
 
 
 @dataclass(frozen=True)
-class OppositeState:
-    """What was committed of an `Opposite`; see its attributes."""
+class KinematicsState:
+    """What was committed of an `ContactKinematics`; see its attributes."""
 
     jump: Array
     angle: float
@@ -130,14 +136,14 @@ class ObstacleMotion:
         return np.asarray(self.offset + (self.turn.directions(moved) - moved))
 
 
-class Opposite(ABC):
+class ContactKinematics(ABC):
     """What lies opposite Γc, under one kinematics.
 
     The ``values`` that methods take are those of the last evaluation where nothing else is said.
     Constructors are collective, and compile what samples the points.
 
     Args:
-        placement: Where the opposite is, seen from the undeformed Γc.
+        placement: Where the opposite is, geometry from the undeformed Γc.
         at_rest: Of an obstacle known in numbers, what has to be sampled for that.
 
     Attributes:
@@ -147,14 +153,14 @@ class Opposite(ABC):
             not in it.
         felt: What laws are functions of there: the jump, or what follows from it.
         given, sampled: What else laws see, as expressions on Γc, and as numbers at the points.
-        in_form, at_points: Kinematics of laws in the form on Γc, and at numbers at the points.
+        in_form, at_points: LocalKinematics of laws in the form on Γc, and at numbers at the points.
         committed_jump: The jump at the last commit, that of the obstacle taken away, (n_points,
             gdim), between the places that are opposite each other now; zero before the first.
         committed_angle: By which the obstacle had turned then (radians).
         is_finite: Whether displacements may be of any size.
         is_rigid: Whether it is a rigid obstacle, whose reactions are external to the mesh.
         follows: Whether the pairs follow the bodies wherever they go.
-        pairs_anew: Whether pairs are found anew, on the deformed bodies, at every commit and in
+        updates_pairs: Whether pairs are found anew, on the deformed bodies, at every commit and in
             increments in which bodies slide.
         sampler: What evaluates a rigid obstacle anywhere; None where it is known on Γc alone, or
             the opposite is another body.
@@ -167,7 +173,7 @@ class Opposite(ABC):
 
     def __init__(
         self,
-        parts: Parts,
+        parts: ContactParts,
         pairs: Pairs,
         jump: fem.Function,
         placement: Placement,
@@ -179,16 +185,16 @@ class Opposite(ABC):
         self._gdim = self._mesh.geometry.dim
         self.given = self._see(placement)
         self.data, self.sampled = self._sample(placement)
-        self.felt = jump
-        self.in_form: Kinematics = SmallKinematics(parts.history, parts.multipliers)
-        self.at_points: Kinematics = self.in_form
+        self.local_jump = jump
+        self.in_form: LocalKinematics = SmallKinematics(parts.history, parts.multipliers)
+        self.at_points: LocalKinematics = self.in_form
         self.committed_jump: Array = np.zeros((parts.quadrature.n_points, self._gdim))
         self.committed_angle = 0.0
         self._displaced: ObstacleMotion | None = None
 
     # ---- construction ----------------------------------------------------------------------------
 
-    def _see(self, placement: Placement) -> Seen:
+    def _see(self, placement: Placement) -> PointGeometry:
         """What laws see, as expressions on Γc."""
         inputs, gap = self._parts.inputs, self._parts.gap
         open_gap = placement.gap
@@ -196,9 +202,9 @@ class Opposite(ABC):
             open_gap = inputs.scalar("gap", gap)
             if inputs.shift is not None:
                 open_gap = open_gap + ufl.dot(inputs.shift, placement.normal)
-        return Seen(open_gap, placement.normal, inputs.shift, inputs.law)
+        return PointGeometry(open_gap, placement.normal, inputs.shift, inputs.law)
 
-    def _sample(self, placement: Placement) -> tuple[PointData, Seen]:
+    def _sample(self, placement: Placement) -> tuple[PointData, PointGeometry]:
         """The same at the points, and more that is known there."""
         inputs, direction, given = self._parts.inputs, placement.direction, self.given
         expressions = {
@@ -224,12 +230,12 @@ class Opposite(ABC):
         own |= {"gap": given.gap, "normal": direction}
         parts = self._parts
         check_given(parts.name, own, parts.quadrature, parts.displacement)
-        seen = ["initial_gap", "normal", *(f"parameter {n}" for n in given.parameters)]
+        geometry = ["initial_gap", "normal", *(f"parameter {n}" for n in given.parameters)]
         if given.shift is not None:
             expressions["obstacle"] = given.shift
-            seen.append("obstacle")
-        data = PointData(parts.name, parts.quadrature, expressions, seen)
-        sampled = Seen(
+            geometry.append("obstacle")
+        data = PointData(parts.name, parts.quadrature, expressions, geometry)
+        sampled = PointGeometry(
             data.ufl("initial_gap"),
             data.ufl("normal"),
             None if given.shift is None else data.ufl("obstacle"),
@@ -243,7 +249,7 @@ class Opposite(ABC):
         Args:
             within: 1 at the points that the latter is confined to, 0 at others.
         """
-        law, quadrature, felt = self._parts.law, self._parts.quadrature, self.felt
+        law, quadrature, felt = self._parts.law, self._parts.quadrature, self.local_jump
         # With finite kinematics all follows from X + u less the motion: derivatives do, too.
         free = {} if self.is_finite else self._parts.inputs.free_shift
         here: dict[str, Any] = {"given": self.given, "free": free}
@@ -304,7 +310,7 @@ class Opposite(ABC):
         rows = self.jump.x.array.reshape(-1, self._gdim)
         return np.array(rows[: self._parts.quadrature.n_points])
 
-    def told(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
+    def outputs(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """What else is known at the points, beside what a law told; see `PointValues`."""
         rows = self.jump.x.array.reshape(-1, self._gdim)[: self._parts.quadrature.n_points]
         return {"jump": rows - self.data.values.get("obstacle", 0.0)}
@@ -447,12 +453,12 @@ class Opposite(ABC):
     # ---- pairs -----------------------------------------------------------------------------------
 
     @property
-    def pairs_anew(self) -> bool:
+    def updates_pairs(self) -> bool:
         """See the class."""
         return False
 
     @property
-    def may_pair_anew(self) -> bool:
+    def can_update_pairs(self) -> bool:
         """Whether pairs are, or may come to be, other ones than those of the undeformed bodies."""
         return False
 
@@ -477,7 +483,7 @@ class Opposite(ABC):
         """
         return 0.0
 
-    def pairs_due(self, values: PointValues) -> bool:
+    def needs_pair_update(self, values: PointValues) -> bool:
         """Whether `commit` will find pairs anew, for which it needs all of ``u``. Collective."""
         return False
 
@@ -507,7 +513,7 @@ class Opposite(ABC):
 
     # ---- history ---------------------------------------------------------------------------------
 
-    def begins_anew(self) -> bool:
+    def reset_reference(self) -> bool:
         """Let ways be counted from the present ``u``; whether that is not where they were from.
 
         Collective.
@@ -521,9 +527,9 @@ class Opposite(ABC):
         """What the history has of displacements at `committed_jump`, by name. Collective."""
         return {"jump": self.committed_jump}
 
-    def feet(self, values: PointValues) -> dict[str, Array]:
+    def projection_points(self, values: PointValues) -> dict[str, Array]:
         """What the history has of displacements at an evaluated state, by name. Collective."""
-        return {"jump": values.foot}
+        return {"jump": values.projection_point}
 
     def committed_fields(self, fields: Mapping[str, Array]) -> dict[str, Array]:
         """What is found of a solution, as the history has it."""
@@ -536,10 +542,10 @@ class Opposite(ABC):
             By how much the jump is another as pairs were found anew, (n_points, gdim) (length);
             None: they were not.
         """
-        self.count_from(values)
+        self.set_reference(values)
         return None
 
-    def count_from(self, values: PointValues) -> None:
+    def set_reference(self, values: PointValues) -> None:
         """Let ways and angles be counted from an evaluated state. Collective."""
         self.committed_jump = values.jump
         self.committed_angle = self.angle(values)
@@ -563,16 +569,16 @@ class Opposite(ABC):
         Args:
             depth: Of the points in the opposite then, (n_points,) (length).
             evaluate: Gives what is at the points now.
-            anew: Whether pairs were found anew there, see `pairs_anew`.
+            anew: Whether pairs were found anew there, see `updates_pairs`.
         """
-        self.count_from(evaluate())
+        self.set_reference(evaluate())
 
-    def state(self) -> OppositeState:
+    def state(self) -> KinematicsState:
         """What was committed, for `set_state`."""
         shape = None if self.sampler is None else self.sampler.committed_shape
-        return OppositeState(self.committed_jump, self.committed_angle, self.pairs.state(), shape)
+        return KinematicsState(self.committed_jump, self.committed_angle, self.pairs.state(), shape)
 
-    def set_state(self, state: OppositeState) -> None:
+    def set_state(self, state: KinematicsState) -> None:
         """Make a state the committed one again. Collective."""
         self.committed_jump, self.committed_angle = state.jump, state.angle
         if self.sampler is not None and state.shape is not None:

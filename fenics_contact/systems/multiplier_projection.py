@@ -24,10 +24,10 @@ from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Mask
 
-__all__ = ["leave_out_unanswered"]
+__all__ = ["project_multiplier_updates"]
 
 
-def leave_out_unanswered(operator: ContactOperator, state: Array, constrained: Mask) -> None:
+def project_multiplier_updates(operator: ContactOperator, state: Array, constrained: Mask) -> None:
     """Let the next change of multipliers be without what displacements do not answer. Collective.
 
     The change is what `Contact.enforcement_error` measures, and what `Contact.augment` makes.
@@ -41,7 +41,7 @@ def leave_out_unanswered(operator: ContactOperator, state: Array, constrained: M
     multipliers = contact.multipliers
     if multipliers is None or not multipliers.as_displacement or not contact.law.has_friction:
         return
-    if contact.opposite.turns:
+    if contact.contact_kinematics.turns:
         return
     held = _at_rest(operator, state, constrained)
     if not global_max(operator.unknowns.comm, held.astype(np.float64)):

@@ -1,4 +1,4 @@
-"""Where the iteration for an increment starts: of several states the one nearest to equilibrium."""
+"""Predictor of an increment: of several states, the one with the least residual."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import numpy as np
 from fenics_contact.contact.point_law import PointTangent
 from fenics_contact.contact.values import PointValues
 from fenics_contact.methods.equations import Equations
-from fenics_contact.parallel import agreed, global_max, global_sum
+from fenics_contact.parallel import broadcast_from_root, global_max, global_sum
 from fenics_contact.systems import dense, linear
 from fenics_contact.systems.least_motion import find_least_motion
 from fenics_contact.systems.system import System
 from fenics_contact.tolerances import FLAT, NEGLIGIBLE
 from fenics_contact.types import Array
 
-__all__ = ["Starts"]
+__all__ = ["Predictor"]
 
 # A start with up to this many times the residual of the best is taken if its points slip.
 _FAR = 100.0
 
 
 @dataclass(frozen=True)
-class _Borne:
+class _ConvergedContact:
     """What a contact bore in a solution.
 
     Attributes:
@@ -37,7 +37,7 @@ class _Borne:
     displacement: Array
 
 
-class Starts:
+class Predictor:
     """States to start from, by what is known of the last increment.
 
     Attributes:
@@ -55,7 +55,7 @@ class Starts:
         self.change: Array | None = None
         self._equations = equations
         self._moved: Array | None = None  # of the values prescribed, since the last increment
-        self._borne: list[_Borne] = []  # by contact, in the solution found last
+        self._converged: list[_ConvergedContact] = []  # by contact, in the solution found last
 
     def moved_from(self, before: Array) -> None:
         """Take note of what the values prescribed now changed. Collective.
@@ -84,18 +84,20 @@ class Starts:
             predict: See the attribute.
         """
         self.factored, self.predict = True, predict
-        self.note_borne()
+        self.store_converged_contacts()
 
-    def note_borne(self) -> None:
+    def store_converged_contacts(self) -> None:
         """Take note of what contacts bear, in the solution or where it has moved. Collective."""
-        self._borne = []
+        self._converged = []
         contacts = self._equations.contacts
         if not any(contact.rigid for contact in contacts):
             return
         for contact in contacts:
             contact.evaluate()
-            displacement = contact.opposite.present_jump()
-            self._borne.append(_Borne(contact.values, contact.acting.tangent(), displacement))
+            displacement = contact.contact_kinematics.present_jump()
+            self._converged.append(
+                _ConvergedContact(contact.values, contact.effective_law.tangent(), displacement)
+            )
 
     def choose(self, *, first_round: bool, cold: bool) -> Array:
         """Choose the unknowns of the system to start from: what is nearest to equilibrium of these.
@@ -126,21 +128,21 @@ class Starts:
         terms = np.where(np.isfinite(terms), terms, 0.0)
         begun = equations.start
         equations.start = replace(begun, terms=np.maximum(begun.terms, terms))
-        starts: list[Array] = []
+        candidates: list[Array] = []
         residuals: list[float] = []
 
         def add(start: Array) -> int:
-            starts.append(start)
+            candidates.append(start)
             residual = equations.residual_at(start)
             residuals.append(residual if np.isfinite(residual) else np.inf)
-            return len(starts) - 1
+            return len(candidates) - 1
 
         add(present)
         forces = equations.function.array_r.copy()
         # Where nothing was borne yet the last increment tells nothing of this one.
         predicts, factored = self.predict and not cold, self.factored and not cold
         self.forget()
-        step = None  # which of the starts is one on the tangent of the last solution
+        step = None  # which of the candidates is one on the tangent of the last solution
         turned = False
         if self._moved is not None:
             if predicts:
@@ -162,8 +164,8 @@ class Starts:
         if self.expected is not None and first_round:
             add(system.part(self.expected))
         if step is not None and not turned and residuals[step] <= _FAR * min(residuals):
-            return starts[step]
-        return starts[int(np.argmin(residuals))]
+            return candidates[step]
+        return candidates[int(np.argmin(residuals))]
 
     def _continued(self, present: Array, forces: Array, change: Array) -> Array:
         """Where a change like that of the last increment leaves no force along it. Collective.
@@ -224,7 +226,7 @@ class Starts:
         tractions = None if anew else self._tractions()
         if tractions is not None:  # obstacles have moved, too
             for operator, borne, traction in zip(
-                full.operators, self._borne, tractions, strict=True
+                full.operators, self._converged, tractions, strict=True
             ):
                 operator.add_force(image, traction - borne.values.total_traction)
         image.array[full.constrained] = 0.0
@@ -266,7 +268,7 @@ class Starts:
             forces.scale(1.0 / equations.full.bulk.scale)
         ksp = equations.solvers[True]
         ksp.solve(forces, step)
-        dense.raise_kept(ksp)
+        dense.raise_stored_error(ksp)
         found = ksp.getConvergedReason() > 0
         linear.forget_failure(ksp.getPC())
         way: Array = -step.array_r
@@ -285,12 +287,12 @@ class Starts:
         """
         equations, tractions, moved = self._equations, [], False
         comm, scales = equations.full.unknowns.comm, equations.full.scales
-        if not self._borne:
+        if not self._converged:
             return None
         for number, (contact, borne) in enumerate(
-            zip(equations.contacts, self._borne, strict=True)
+            zip(equations.contacts, self._converged, strict=True)
         ):
-            opposite, traction = contact.opposite, borne.values.total_traction
+            opposite, traction = contact.contact_kinematics, borne.values.total_traction
             change = np.linalg.norm(opposite.present_jump() - borne.displacement, axis=1)
             if global_max(comm, change / scales.size_at_points(number)) > NEGLIGIBLE:
                 return None
@@ -327,7 +329,9 @@ class Starts:
         every = np.array([system.part(field) for field in free])
         fields = modes @ every
         sums = global_sum(comm, np.column_stack([fields @ fields.T, fields @ way]))
-        share = agreed(comm, np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=NEGLIGIBLE)[0])
+        share = broadcast_from_root(
+            comm, np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=NEGLIGIBLE)[0]
+        )
         way = way - share @ fields
         system.set_state(present)
         states, bear, closed = [], [], []

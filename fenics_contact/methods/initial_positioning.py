@@ -10,16 +10,22 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 
-from fenics_contact.contact.opposite import ObstacleMotion
+from fenics_contact.contact.contact_kinematics import ObstacleMotion
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import agreed, gather_rows, global_max, global_min, global_sum
+from fenics_contact.parallel import (
+    broadcast_from_root,
+    gather_rows,
+    global_max,
+    global_min,
+    global_sum,
+)
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.least_motion import minimise_norm
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes, tangential_gram
 from fenics_contact.tolerances import FLAT, NEGLIGIBLE
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["Approach"]
+__all__ = ["InitialPositioning"]
 
 # Contact forces that sum up to less than this share of the load on a free motion are none yet.
 _IDLE = 1e-3
@@ -58,7 +64,7 @@ def _feeling(jumps: Array) -> Mask:
 
 
 @dataclass(frozen=True)
-class Approach:
+class InitialPositioning:
     """Where bodies without contact come from and go to in an increment.
 
     Attributes:
@@ -144,7 +150,7 @@ class Approach:
                 if self._find_rest_position(which):
                     along = self._fit_obstacle_motion(which, motions)
                     for contact, jumps in zip(full.contacts, self._felt(of_bodies)[1], strict=True):
-                        contact.states.count_slip_from_here(_feeling(jumps))
+                        contact.states.set_slip_reference(_feeling(jumps))
             full.evaluate_at(aloft)
             if along is not None:
                 self._move(which, along)
@@ -177,7 +183,7 @@ class Approach:
             work += np.einsum("mqd,q,qd->m", jumps, weights, way)
         comm = self.full.unknowns.comm
         gram, work = global_sum(comm, gram), global_sum(comm, work)
-        return agreed(comm, np.linalg.lstsq(gram, work, rcond=_SHARED)[0])
+        return broadcast_from_root(comm, np.linalg.lstsq(gram, work, rcond=_SHARED)[0])
 
     @contextlib.contextmanager
     def _obstacles_at_start(self) -> Iterator[list[ObstacleMotion]]:
@@ -188,10 +194,12 @@ class Approach:
         """
         self.full.evaluate_at(self.before)
         contacts = self.full.contacts
-        motions = [contact.opposite.motion_in_increment(contact.values) for contact in contacts]
+        motions = [
+            contact.contact_kinematics.motion_in_increment(contact.values) for contact in contacts
+        ]
         with contextlib.ExitStack() as back:
             for contact, motion in zip(contacts, motions, strict=True):
-                back.enter_context(contact.opposite.displaced(motion))
+                back.enter_context(contact.contact_kinematics.displaced(motion))
             yield motions
 
     def _find_rest_position(self, which: Index) -> bool:
@@ -230,7 +238,7 @@ class Approach:
         drive = global_sum(comm, fields @ self.load)
         most = np.abs(drive).max()
         mass = global_sum(comm, fields @ fields.T)
-        opposites = [contact.opposite for contact in self.full.contacts]
+        opposites = [contact.contact_kinematics for contact in self.full.contacts]
         jumps = [o.displaced_directions(j) for o, j in zip(opposites, jumps, strict=True)]
         return _Free(which, drive / most, mass, jumps) if most > 0 else None
 
@@ -245,7 +253,7 @@ class Approach:
     def _to_first_touch(self, free: _Free) -> Array | None:
         """The way by which the load leads to first touch; None: it meets nothing. Collective."""
         comm = self.full.unknowns.comm
-        coefficients = agreed(comm, np.linalg.solve(free.mass, free.drive))
+        coefficients = broadcast_from_root(comm, np.linalg.solve(free.mass, free.drive))
         coefficients /= np.abs(coefficients).max()
         way = np.inf
         for contact, jumps in zip(self.full.contacts, free.jumps, strict=True):
@@ -326,11 +334,13 @@ class Approach:
         # There are motions that nothing feels.
         felt += NEGLIGIBLE * np.trace(felt) * np.eye(len(felt))
         shares, vectors = scipy.linalg.eigh(rubs, felt)
-        ways = agreed(comm, vectors[:, shares < along])
+        ways = broadcast_from_root(comm, vectors[:, shares < along])
         limits = gather_rows(comm, np.concatenate(rows))
         # What closes no gap, as to go along a corner, round-off of the load would take to no end.
         _, closes, kept = np.linalg.svd(limits[:, :-1] @ ways, full_matrices=False)
-        ways = agreed(comm, ways @ kept[closes > NEGLIGIBLE * closes.max(initial=0.0)].T)
+        ways = broadcast_from_root(
+            comm, ways @ kept[closes > NEGLIGIBLE * closes.max(initial=0.0)].T
+        )
         work = drive @ ways
         if not len(work):
             return None
@@ -350,7 +360,7 @@ class Approach:
         # What was let go, obstacles may have moved into: it goes out, or no deeper where it cannot.
         for deep in (gaps, np.maximum(gaps, NEGLIGIBLE)):
             limit = np.concatenate([deep, ends])
-            found = agreed(comm, _maximise(work, matrix, limit))
+            found = broadcast_from_root(comm, _maximise(work, matrix, limit))
             if found is not None or gaps.min() >= 0:
                 break
         if found is None:
@@ -362,7 +372,7 @@ class Approach:
         both = np.concatenate([matrix, -matrix[bearing]])
         limit = np.concatenate([limit, 0.1 * NEGLIGIBLE - limit[bearing]])
         mass = ways.T @ free.mass @ ways
-        least = agreed(comm, minimise_norm(mass, np.zeros(len(work)), both, limit))
+        least = broadcast_from_root(comm, minimise_norm(mass, np.zeros(len(work)), both, limit))
         return far * (ways @ (place if least is None else least))
 
 

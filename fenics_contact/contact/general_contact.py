@@ -16,7 +16,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.joining import JoinedMesh
 from fenics_contact.laws.base import Law
 from fenics_contact.obstacles.deformable import DeformableBody
-from fenics_contact.parallel import agreed, collective_errors, warn
+from fenics_contact.parallel import broadcast_from_root, collective_errors, warn
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_cells
@@ -114,7 +114,7 @@ def find_contact_pairs(
             "distance; bodies that overlap by more than half a cell are not found",
         )
 
-    on = [agreed(comm, _side_of_surface(pair, names, slave_bodies)) for pair in found]
+    on = [broadcast_from_root(comm, _side_of_surface(pair, names, slave_bodies)) for pair in found]
     roles = [pair.facets[side] for pair, side in zip(found, on, strict=True)]
     roles += [pair.facets[1 - side] for pair, side in zip(found, on, strict=True)]
     marks, tags_of = _marked(mesh, roles)

@@ -24,13 +24,13 @@ from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array
 from fenics_contact.wording import percent
 
-__all__ = ["Judge"]
+__all__ = ["Verifier"]
 
 # Growth of what small displacements leave out from which on it is said again.
 _AGAIN = 2.0
 
 
-class Judge:
+class Verifier:
     """Looks at evaluated states of a problem.
 
     Attributes:
@@ -58,7 +58,7 @@ class Judge:
         # A body of one node has no rotations.
         self._inverse = np.linalg.pinv(global_sum(self._comm, products), hermitian=True)
 
-    def judge(
+    def verify(
         self,
         system: System,
         bulk: Array,

@@ -18,7 +18,7 @@ from mpi4py import MPI
 
 from fenics_contact import compat
 from fenics_contact.contact.contact import Contact
-from fenics_contact.histories.archive import Stored, refuse
+from fenics_contact.histories.checkpoint_file import StoredCheckpoint, refuse
 from fenics_contact.problem import ContactProblem
 from fenics_contact.surface.facets import facet_cells
 from fenics_contact.tolerances import NEGLIGIBLE
@@ -69,7 +69,7 @@ def gather(comm: MPI.Comm, places: Array, *values: Array | dict[str, Array]) -> 
     return np.zeros((0, 0)) if gathered is None else np.concatenate(gathered)
 
 
-def find(comm: MPI.Comm, stored: Stored, name: str, places: Array, size: float) -> Array:
+def find(comm: MPI.Comm, stored: StoredCheckpoint, name: str, places: Array, size: float) -> Array:
     """The stored values at given places, (n, n_values). Collective.
 
     Args:

@@ -20,10 +20,10 @@ from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array, Indices, Mask
 
-__all__ = ["acting", "distances", "nearest", "touched"]
+__all__ = ["active_points", "distances", "nearest", "touched"]
 
 
-def acting(contact: Contact) -> Mask:
+def active_points(contact: Contact) -> Mask:
     """At which of this rank's points the law acts, as evaluated, or would act on any slip.
 
     Friction of a given limit does so where the gap is open, too.
@@ -41,7 +41,7 @@ def distances(contact: Contact) -> Array:
     then is no motion. Infinity at points without an opposite.
     """
     gap = np.where(contact.paired, contact.values.gap, np.inf)
-    return np.where(acting(contact) | contact.gap_prescribed, -np.inf, gap)
+    return np.where(active_points(contact) | contact.gap_prescribed, -np.inf, gap)
 
 
 def touched(
