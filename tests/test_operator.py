@@ -100,7 +100,7 @@ def test_pairs_found_anew_take_another_operator_for_their_contact_alone():
     assert all(a is b for a, b in zip(before, system.operators, strict=True))
     u.interpolate(lambda x: np.vstack([np.where(x[1] > 0.5, 0.3, 0.0), 0 * x[0]]))
     old = read(before[0])
-    pair.opposite.find_pairs(u, np.zeros(pair.quadrature.n_points))
+    pair.contact_kinematics.find_pairs(u, np.zeros(pair.quadrature.n_points))
     after = system.operators
     assert after[0] is not before[0] and after[1] is before[1]
     assert [operator.contact for operator in after] == [pair, floor]

@@ -257,8 +257,8 @@ class Equations:
         present pressure, with which a step along the mode goes as far as they have slipped, by the
         share of the forces on the mode that is not in balance. Open points get the stiffness with
         which it closes the nearest gap (`UnconstrainedModes.closing`), where slipping points would
-        not hold the body if they stuck. Open points at which friction acts all the same (a bound that
-        does not depend on the pressure) count as slipping points along Γc. With what is not in balance
+        not hold the body if they stuck. Open points at which friction acts all the same (a bound
+        that does not depend on the pressure) count as slipping points along Γc. With the residual
         the regularisation vanishes, and convergence stays superlinear (Levenberg-Marquardt).
         """
         full, modes = self.full, self._unconstrained_modes()
