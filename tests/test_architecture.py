@@ -52,16 +52,8 @@ BY_RELEASE = {
 }
 KNOWN = {
     *("problem", "contact", "system", "solver", "operator", "unknowns", "verdict", "law", "bulk"),
-    *(
-        "equations",
-        "method",
-        "surface",
-        "quadrature",
-        "verifier",
-        "motions",
-        "contact_kinematics",
-        "obstacle",
-    ),
+    *("equations", "method", "surface", "quadrature", "verifier", "motions", "obstacle"),
+    "contact_kinematics",
 }
 
 

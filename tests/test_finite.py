@@ -201,9 +201,8 @@ def test_without_friction_the_tangent_is_symmetric():
     mirrored = tangent.copy().transpose()
     mirrored.axpy(-1.0, tangent)
     assert 0 < tangent.norm() and mirrored.norm() < 1e-13 * tangent.norm()
-    assert not scene.contact(
-        disc(scene, 0.8), fc.Tresca(0.3, 1.0, K, K)
-    ).effective_law.has_potential
+    tresca = scene.contact(disc(scene, 0.8), fc.Tresca(0.3, 1.0, K, K))
+    assert not tresca.effective_law.has_potential
 
 
 def _refused(arguments, law=None, **options):
