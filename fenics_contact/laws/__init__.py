@@ -1,1 +1,1 @@
-"""Contact laws: what a point of Γc answers to its gap and slip."""
+"""Contact laws: tractions at a point of Γc as a function of gap and slip."""

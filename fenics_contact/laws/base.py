@@ -37,8 +37,8 @@ class PointKinematics:
         normal: Unit normal n from the body to the obstacle, shape (gdim,).
         tangential_displacement: Tangential displacement u_t relative to the obstacle, eq. (1)
             (length), shape (gdim,); None if the law has no tangential traction.
-        tangential_increment: Increment Δu_t of it since the last commit (length), shape (gdim,);
-            None without friction.
+        tangential_increment: Increment Δu_t since the last commit (length), shape (gdim,); None
+            without friction.
         traction: Tangential traction τ_old at the last commit, eq. (7), or the multiplier λ_t,
             eq. (8) (stress), shape (gdim,); None without friction.
         multiplier: Multiplier λ_n ≥ 0 of the augmented Lagrangian, eq. (8) (stress); None with a
@@ -81,7 +81,7 @@ class Parameters(dict[str, Any]):
         self._law = type(law).__name__
 
     def __missing__(self, name: str) -> Any:
-        """Say which there are."""
+        """Raise a ValueError that lists the parameters of the law."""
         raise ValueError(
             f"{self._law} asks for a parameter {name!r}; its fields, which are its parameters, are "
             f"{sorted(self)}"
@@ -120,8 +120,8 @@ class Law:
     @property
     def has_own_normal(self) -> bool:
         """Whether r_n derives from a `normal_potential` of the subclass, not from k_n."""
-        own = type(self).normal_potential is not Law.normal_potential
-        return self.has_normal_stiffness and (own or "k_n" not in self.parameters())
+        is_overridden = type(self).normal_potential is not Law.normal_potential
+        return self.has_normal_stiffness and (is_overridden or "k_n" not in self.parameters())
 
     @property
     def has_tension(self) -> bool:
@@ -146,7 +146,7 @@ class Law:
         """Check that the law is defined in ``gdim`` dimensions.
 
         Raises:
-            ValueError: It is not.
+            ValueError: The law is not defined in this dimension.
         """
 
     def check_complete(self) -> None:
@@ -238,7 +238,8 @@ class Law:
     def circumradius(self, parameters: Values) -> Expr | None:
         """Return the largest |τ| on the yield surface of friction bound 1; None if it is unknown.
 
-        If it is unknown, limit analysis does not apply, and no load is refused because of friction.
+        If it is unknown, limit analysis does not apply, and no load is rejected because of
+        friction.
         """
         return None
 
@@ -290,9 +291,9 @@ class Law:
         """Return the frictional dissipation per area, -τ·(Δu_t + K_t⁻¹ Δτ) ≥ 0."""
         assert response.traction is not None
         assert kinematics.traction is not None and kinematics.tangential_increment is not None
-        change = response.traction - kinematics.traction
-        stretched = self.elastic_displacement(kinematics, change, parameters)
-        return -ufl.dot(response.traction, kinematics.tangential_increment + stretched)
+        traction_change = response.traction - kinematics.traction
+        elastic_change = self.elastic_displacement(kinematics, traction_change, parameters)
+        return -ufl.dot(response.traction, kinematics.tangential_increment + elastic_change)
 
 
 def signorini(kinematics: PointKinematics, k_n: Expr) -> Expr:

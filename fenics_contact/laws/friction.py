@@ -89,7 +89,7 @@ class FrictionLaw(Law):
 
     def with_given_friction_bound(self) -> Law:
         """Return this law with a friction bound given by a parameter "friction_bound" (stress)."""
-        return self if self.has_potential else _GivenBound(self)
+        return self if self.has_potential else _GivenBoundLaw(self)
 
     def check_dimension(self, gdim: int) -> None:
         """Check that ``modes`` and ``transverse_friction`` are given in space only.
@@ -121,8 +121,8 @@ class FrictionLaw(Law):
     def circumradius(self, parameters: Values) -> Expr | None:
         """Return the largest |τ| on the yield surface of friction bound 1.
 
-        It is that of the polygon's vertices, along the larger half-axis; None if a subclass has
-        its own yield functions.
+        It is the distance of the polygon's vertices along the larger half-axis; None if a subclass
+        defines its own yield functions.
         """
         if type(self).yield_functions is not FrictionLaw.yield_functions:
             return None
@@ -133,9 +133,10 @@ class FrictionLaw(Law):
         return radius * ufl.max_value(1.0, ratio)
 
     def _frame(self, normal: Expr, parameters: Values) -> tuple[Expr, Expr]:
-        """Orthonormal vectors of the tangent plane, the first along the direction.
+        """Return orthonormal tangent vectors, the first along the projected direction.
 
-        Without a direction it is that of x, or of y where the normal is nearly along x.
+        Without ``direction`` the x axis is projected, or the y axis if the normal is nearly along
+        x.
         """
         if self.direction is None:
             x = ufl.conditional(ufl.lt(abs(normal[0]), 0.9), 1.0, 0.0)
@@ -147,10 +148,7 @@ class FrictionLaw(Law):
         return first, ufl.cross(normal, first)
 
     def _sides(self, normal: Expr, parameters: Values) -> list[tuple[Expr, Expr]]:
-        """Of each side of the polygon the outward normal, and the vector along it.
-
-        The first side is across the direction.
-        """
+        """Return the outward normal and tangent of each side; the first normal is ``direction``."""
         assert self.modes is not None
         first, second = self._frame(normal, parameters)
         sides = []
@@ -159,8 +157,8 @@ class FrictionLaw(Law):
             sides.append((c * first + s * second, -s * first + c * second))
         return sides
 
-    def _stretched(self, vector: Expr, power: int, normal: Expr, parameters: Values) -> Expr:
-        """B to a power, times a tangential vector."""
+    def _stretch(self, vector: Expr, power: int, normal: Expr, parameters: Values) -> Expr:
+        """Return B^power times a tangential vector."""
         if self.transverse_friction is None:
             return vector
         first, second = self._frame(normal, parameters)
@@ -179,7 +177,7 @@ class FrictionLaw(Law):
         self, kinematics: PointKinematics, traction: Expr, parameters: Values
     ) -> Expr:
         """Return the elastic displacement K_t⁻¹ τ = B⁻² τ/k_t (length), shape (gdim,)."""
-        return self._stretched(traction, -2, kinematics.normal, parameters) / parameters["k_t"]
+        return self._stretch(traction, -2, kinematics.normal, parameters) / parameters["k_t"]
 
     def yield_functions(
         self, kinematics: PointKinematics, traction: Expr, bound: Expr, parameters: Values
@@ -193,18 +191,18 @@ class FrictionLaw(Law):
         if len(n) == 2:
             along = ufl.dot(traction, perpendicular(n))
             return along - bound, -along - bound
-        sigma = self._stretched(traction, -1, n, parameters)
+        sigma = self._stretch(traction, -1, n, parameters)
         if self.modes is None:
             return (norm(sigma) - bound,)
         return tuple(ufl.dot(sigma, a) - bound for a, _ in self._sides(n, parameters))
 
-    def _return(
+    def _return_in_sigma(
         self, kinematics: PointKinematics, bound: Expr, parameters: Values
     ) -> tuple[Expr, Expr, tuple[Expr, ...]]:
         """Return σ*, σ and Δβ of each mode by the return map in σ, eq. (7)."""
         n, k_t = kinematics.normal, parameters["k_t"]
-        trial = self._stretched(kinematics.traction, -1, n, parameters)
-        trial = trial - k_t * self._stretched(kinematics.tangential_increment, 1, n, parameters)
+        trial = self._stretch(kinematics.traction, -1, n, parameters)
+        trial = trial - k_t * self._stretch(kinematics.tangential_increment, 1, n, parameters)
         if len(n) == 2:
             sigma, excess = return_to_segment(trial, bound, perpendicular(n))
         elif self.modes is None:
@@ -217,21 +215,18 @@ class FrictionLaw(Law):
         self, kinematics: PointKinematics, bound: Expr, parameters: Values
     ) -> tuple[Expr, tuple[Expr, ...]]:
         """Return τ at the end of the increment, shape (gdim,), and Δβ of each mode, eq. (7)."""
-        _, sigma, slip = self._return(kinematics, bound, parameters)
-        return self._stretched(sigma, 1, kinematics.normal, parameters), slip
+        _, sigma, slip = self._return_in_sigma(kinematics, bound, parameters)
+        return self._stretch(sigma, 1, kinematics.normal, parameters), slip
 
     def sliding_potential(
         self, kinematics: PointKinematics, bound: Expr, parameters: Values
     ) -> Expr:
-        """Return the potential of τ for a given bound, with τ = -∂/∂Δu_t.
-
-        It is (|σ*|² - |σ* - σ|²)/(2 k_t), whose gradient by σ* is the closest point σ over k_t.
-        """
-        trial, sigma, _ = self._return(kinematics, bound, parameters)
+        """Return the potential (|σ*|² - |σ* - σ|²)/(2 k_t) of τ = -∂/∂Δu_t for a given bound."""
+        trial, sigma, _ = self._return_in_sigma(kinematics, bound, parameters)
         return ufl.dot(sigma, trial - sigma / 2) / parameters["k_t"]
 
 
-class _GivenBound(FrictionLaw):
+class _GivenBoundLaw(FrictionLaw):
     """A friction law with a friction bound given by the parameter "friction_bound"."""
 
     has_potential = True
@@ -242,11 +237,11 @@ class _GivenBound(FrictionLaw):
         self.transverse_friction = law.transverse_friction
 
     def contact_traction(self, kinematics: PointKinematics, parameters: Values) -> ContactTraction:
-        """Return the tractions of the law, with τ by the given friction bound."""
+        """Return the tractions of the law, with τ returned to the given friction bound."""
         bound = parameters["friction_bound"]
         traction, slip = self._law.return_map(kinematics, bound, parameters)
-        found = self._law.contact_traction(kinematics, parameters)
-        return replace(found, traction=traction, friction_bound=bound, slip=slip)
+        result = self._law.contact_traction(kinematics, parameters)
+        return replace(result, traction=traction, friction_bound=bound, slip=slip)
 
     def potential(self, kinematics: PointKinematics, parameters: Values) -> Expr:
         """Return the energy per area of the normal tractions and of given friction."""
@@ -339,7 +334,7 @@ class Tresca(FrictionLaw):
 
     @property
     def has_normal_stiffness(self) -> bool:
-        """Whether r_n depends on the gap: as ``unilateral`` says."""
+        """Whether r_n depends on the gap, which is the argument ``unilateral``."""
         return self.unilateral
 
     def parameters(self) -> dict[str, Any]:

@@ -17,10 +17,9 @@ __all__ = [
     "return_to_segment",
 ]
 
-# A trial beyond the limit by no more than this share of it sticks. A point that slipped in the last
-# increment stands at its limit when the next one begins: whether it sticks or slips there must not
-# hang on round-off, which is another one in other units.
-_TIE = 1e-12
+# A trial traction above the limit by less than this fraction of it sticks: a point that slipped in
+# the last increment starts at its limit, where round-off must not decide between stick and slip.
+_SLIP_EXCESS_RATIO = 1e-12
 
 
 def positive_part(value: Expr) -> Expr:
@@ -47,39 +46,36 @@ def return_to_segment(trial: Expr, limit: Expr, tangent: Expr) -> tuple[Expr, tu
 
     Args:
         trial: Trial traction τ* of a sticking point, shape (2,).
-        limit: μ p ≥ 0.
+        limit: Friction bound μ p ≥ 0 (stress).
         tangent: Unit vector, shape (2,).
 
     Returns:
         τ, shape (2,), and k_t Δβ of each mode (stress).
     """
     along = ufl.dot(trial, tangent)
-    excess = (_beyond(along, limit), _beyond(-along, limit))
-    slips = ufl.gt(abs(along), (1 + _TIE) * limit)
-    kept = ufl.conditional(slips, clip(along, limit), along)
-    return _where_borne(limit, kept) * tangent, excess
+    excess = (_excess(along, limit), _excess(-along, limit))
+    slips = ufl.gt(abs(along), (1 + _SLIP_EXCESS_RATIO) * limit)
+    returned = ufl.conditional(slips, clip(along, limit), along)
+    return _zero_without_limit(limit, returned) * tangent, excess
 
 
-def _where_borne(limit: Expr, value: Expr) -> Expr:
-    """Return the value, or zero where the limit is zero: a point without friction never sticks.
-
-    Trial and limit of an open point are both zero; if it counted as sticking, k_t would enter the
-    tangent or not by round-off.
-    """
+def _zero_without_limit(limit: Expr, value: Expr) -> Expr:
+    """Return ``value``, or zero where the limit is zero, so that open points never stick."""
+    # Trial and limit of an open point are zero: round-off would put k_t into its tangent or not.
     return ufl.conditional(ufl.gt(limit, 0), value, 0 * value)
 
 
-def _beyond(value: Expr, limit: Expr) -> Expr:
-    """Return value - limit where the point slips, else 0."""
-    return ufl.conditional(ufl.gt(value, (1 + _TIE) * limit), value - limit, 0)
+def _excess(value: Expr, limit: Expr) -> Expr:
+    """Return value - limit where the point slips, otherwise 0."""
+    return ufl.conditional(ufl.gt(value, (1 + _SLIP_EXCESS_RATIO) * limit), value - limit, 0)
 
 
 def return_to_cone(trial: Expr, limit: Expr) -> tuple[Expr, tuple[Expr, ...]]:
     """Return τ and k_t Δβ in space, with the one mode g = |τ| - limit of the circular cone."""
-    # The norm is only used, and only differentiated, where it exceeds the limit: never at zero.
+    # The norm is used and differentiated only where it exceeds the limit, hence never at zero.
     size = ufl.sqrt(ufl.dot(trial, trial))
-    slips = ufl.gt(size, (1 + _TIE) * limit)
-    traction = _where_borne(limit, ufl.conditional(slips, limit / size, 1)) * trial
+    slips = ufl.gt(size, (1 + _SLIP_EXCESS_RATIO) * limit)
+    traction = _zero_without_limit(limit, ufl.conditional(slips, limit / size, 1)) * trial
     return traction, (ufl.conditional(slips, size - limit, 0),)
 
 
@@ -89,24 +85,29 @@ def return_to_polygon(
     """Return map in space, with the modes g_j = τ·a_j - limit of a regular polygon.
 
     With x = τ*·a_j, y = τ*·b_j and half a side H = limit tan(π/n), mode j is exceeded by
-    ⟨x - limit - cot(2π/n) ⟨|y| - H⟩₊⟩₊: beyond the end of the side it shares the excess with its
-    neighbour, which is the same formula for the other one. No search for the sector is needed.
+    ⟨x - limit - cot(2π/n) ⟨|y| - H⟩₊⟩₊: beyond the end of the side the excess is divided between
+    the side and its neighbour, so that no search for the sector is needed.
 
     Args:
-        trial: τ*, shape (3,).
+        trial: Trial traction τ*, shape (3,).
         limit: Radius of the inscribed circle.
-        sides: Outward unit normal a_j of every side, and the unit vector b_j along it.
+        sides: Outward unit normal a_j and unit tangent b_j of every side.
 
     Returns:
         τ, shape (3,), and k_t Δβ of each mode (stress).
     """
-    half, share = math.tan(math.pi / len(sides)), 1 / math.tan(2 * math.pi / len(sides))
+    half_side_ratio, neighbour_factor = (
+        math.tan(math.pi / len(sides)),
+        1 / math.tan(2 * math.pi / len(sides)),
+    )
     traction, excess = trial, []
     for a, b in sides:
         x, y = ufl.dot(trial, a), ufl.dot(trial, b)
-        over = _beyond(x - share * positive_part(abs(y) - half * limit), limit)
-        # The closest point of this side: at a vertex both neighbours give the same.
-        on_side = limit * a + clip(y, half * limit) * b
-        traction = ufl.conditional(ufl.gt(over, 0), on_side, traction)
-        excess.append(over)
-    return _where_borne(limit, traction), tuple(excess)
+        mode_excess = _excess(
+            x - neighbour_factor * positive_part(abs(y) - half_side_ratio * limit), limit
+        )
+        # The closest point of this side; at a vertex both sides give the same point.
+        on_side = limit * a + clip(y, half_side_ratio * limit) * b
+        traction = ufl.conditional(ufl.gt(mode_excess, 0), on_side, traction)
+        excess.append(mode_excess)
+    return _zero_without_limit(limit, traction), tuple(excess)

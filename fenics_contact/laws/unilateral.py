@@ -82,7 +82,7 @@ class Foundation(Law):
 
     @property
     def has_tension(self) -> bool:
-        """Whether r_n is tensile where the gap is open: as ``tension`` says."""
+        """Whether r_n is tensile where the gap is open, which is the argument ``tension``."""
         return self.tension
 
     def parameters(self) -> dict[str, Any]:
@@ -90,7 +90,7 @@ class Foundation(Law):
         return {"k_n": self.k_n} | ({"k_t": self.k_t} if self.has_tangential else {})
 
     def contact_traction(self, kinematics: PointKinematics, parameters: Values) -> ContactTraction:
-        """Return r_n = -k_n (u_n - s) and τ = -k_t u_t, without tension where closed only."""
+        """Return r_n = -k_n (u_n - s) and τ = -k_t u_t; without tension only if closed."""
         k_n, gap = parameters["k_n"], kinematics.gap
         r_n = k_n * gap if self.tension else signorini(kinematics, k_n)
         if not self.has_tangential:
