@@ -1,4 +1,4 @@
-"""What lies opposite Γc where it is another body."""
+"""Kinematics of contact between Γc and an opposing deformable body."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from fenics_contact.types import Array, Mask
 
 __all__ = ["MAX_SLIDE", "NEGLIGIBLE_SLIDE", "BodyFinite", "BodySmall"]
 
-# Slide relative to the facet size from which on pairs of the undeformed bodies are replaced. In
-# partial slip of fine meshes the slide is half of a facet: with other pairs twice the load is not
-# twice the displacement (0.3 %), and the energy of a fretting cycle is further from Mindlin's.
+# Slide relative to the facet size above which pairs of the undeformed bodies are replaced. In
+# partial slip of fine meshes the slide is half a facet: an update would make displacements deviate
+# from proportionality to the load (0.3 %), and the energy of a fretting cycle from Mindlin's.
 MAX_SLIDE = 1.0
-# Slide relative to the facet size below which pairs need not be found anew.
+# Slide relative to the facet size below which pairs need no update.
 NEGLIGIBLE_SLIDE = 1e-2
 
 
 class BodySmall(ContactKinematics):
-    """Another body, paired with the points of the undeformed bodies, or of deformed ones.
+    """Small displacements between bodies, with pairs of the undeformed or of deformed bodies.
 
     Args:
-        pairs: Pairs of the points; by default such as stay.
+        pairs: Pairs of the points; by default pairs that do not follow the bodies.
     """
 
     is_rigid = False
@@ -44,121 +44,121 @@ class BodySmall(ContactKinematics):
         super().__init__(parts, pairs, parts.new_jump(), Placement(pairs.distance, normal))
 
     def outputs(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
-        """See `ContactKinematics`."""
-        told = super().outputs(arrays) | self._pair_outputs(arrays)
-        since = 0.0 if self.pairs.found_jump is None else self.pairs.found_jump
-        slide, normal = told["jump"] - since, arrays["normal"]
+        """Return the fields of `ContactKinematics.outputs`, pairing, depth and slide."""
+        outputs = super().outputs(arrays) | self._pair_outputs(arrays)
+        pairing_jump = 0.0 if self.pairs.pairing_jump is None else self.pairs.pairing_jump
+        slide, normal = outputs["jump"] - pairing_jump, arrays["normal"]
         slide = slide - np.sum(slide * normal, axis=1)[:, None] * normal
-        return told | {"slide": slide}
+        return outputs | {"slide": slide}
 
     def _pair_outputs(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
-        """Which points have an opposite, and how deep they are in it."""
+        """Return pairing and penetration depth of the points."""
         depth = self.pairs.depth(arrays["normal_displacement"])
         return {"paired": self.pairs.paired.astype(np.float64), "depth": depth}
 
     def true_placement(self, values: PointValues) -> tuple[Array, Array]:
-        """See `ContactKinematics`."""
+        """Return gap and normal at X + u by a separate search. Collective."""
         return self.pairs.true_gap(values)
 
     def deviation(self, values: PointValues) -> tuple[Array, Array]:
-        """See `ContactKinematics`."""
+        """Return the true gap minus the linearised gap, and the true normal. Collective."""
         gap, normal = self.true_placement(values)
         linear = np.where(self.pairs.paired, self.pairs.linear_gap(values.normal), 0.0)
         return gap - linear, normal
 
     @property
     def updates_pairs(self) -> bool:
-        """See `ContactKinematics`."""
-        found_before = self.pairs.found_at is not None
-        return self._update == "increment" or (self._update == "auto" and found_before)
+        """Whether pairs are updated at every commit and where bodies slide."""
+        has_updated = self.pairs.found_at is not None
+        return self._update_policy == "increment" or (self._update_policy == "auto" and has_updated)
 
     @property
     def can_update_pairs(self) -> bool:
-        """See `ContactKinematics`."""
-        return self._update != "never"
+        """Whether pairs may be updated, unless ``update_pairs`` is "never"."""
+        return self._update_policy != "never"
 
     @property
-    def _update(self) -> str:
+    def _update_policy(self) -> str:
         obstacle = self._parts.obstacle
         assert isinstance(obstacle, DeformableBody)
         return obstacle.update_pairs
 
     def needs_pair_update(self, values: PointValues) -> bool:
-        """See `ContactKinematics`."""
-        if self.updates_pairs or self._update != "auto":
+        """Whether `commit` will update the pairs, for which it needs all of ``u``. Collective."""
+        if self.updates_pairs or self._update_policy != "auto":
             return self.updates_pairs
         comm, paired = self._mesh.comm, self.pairs.paired
         if comm.allreduce(int(np.any(self.transmitting_points(values)))):
             return self.largest_slide(values) > MAX_SLIDE
-        # Of open points, to whom pairs are nothing yet, only where a body was carried elsewhere;
-        # where there are no pairs at all it may come to some.
+        # Pairs of open points matter only if a body has been displaced as a whole; without any
+        # pair it may have come to some.
         if comm.allreduce(int(np.any(paired))):
-            return self._farthest(values.slide, paired) > MAX_SLIDE
-        return self._farthest(self.pairs.own_displacement(), ~paired) > MAX_SLIDE
+            return self._largest_ratio(values.slide, paired) > MAX_SLIDE
+        return self._largest_ratio(self.pairs.own_displacement(), ~paired) > MAX_SLIDE
 
     def needs_new_pairs(self, values: PointValues, of: PointValues | None = None) -> bool:
-        """See `ContactKinematics`."""
+        """Whether points have slid off their pairs, or could be paired now. Collective."""
         if not self.can_update_pairs:
             return False
-        return self.largest_slide(values, of) > self.slide_limit or self._comes_to_pairs(values)
+        return self.largest_slide(values, of) > self.slide_limit or self._has_new_pairs(values)
 
-    def _comes_to_pairs(self, values: PointValues) -> bool:
-        """Whether points without a pair that have moved would find one now. Collective."""
+    def _has_new_pairs(self, values: PointValues) -> bool:
+        """Whether unpaired points that have slid have an opposite point now. Collective."""
         pairs = self.pairs
         if pairs.n_unpaired == 0:
             return False
-        way = pairs.moved_since_found()
-        way -= np.sum(way * values.normal, axis=1)[:, None] * values.normal
-        if not self._farthest(way, ~pairs.paired) > self.slide_limit:
+        displacement = pairs.displacement_since_pairing()
+        displacement -= np.sum(displacement * values.normal, axis=1)[:, None] * values.normal
+        if not self._largest_ratio(displacement, ~pairs.paired) > self.slide_limit:
             return False
         gap, _ = self.true_placement(values)
         return bool(self._mesh.comm.allreduce(int(np.any(~np.isnan(gap) & ~pairs.paired))))
 
     def transmitting_points(self, values: PointValues) -> Mask:
-        """See `ContactKinematics`."""
+        """Return a mask of the points that transmit forces to another body, (n_points,)."""
         return self.pairs.paired & (np.abs(values.total_traction).max(axis=1) > 0)
 
     def largest_slide(self, values: PointValues, of: PointValues | None = None) -> float:
-        """See `ContactKinematics`."""
-        return self._farthest(values.slide, self.transmitting_points(of or values))
+        """Return the largest slide of points that transmit forces, per facet size. Collective."""
+        return self._largest_ratio(values.slide, self.transmitting_points(of or values))
 
     @property
     def slide_limit(self) -> float:
-        """See `ContactKinematics`."""
+        """Largest admissible `largest_slide` of a solution."""
         return NEGLIGIBLE_SLIDE if self.updates_pairs else MAX_SLIDE
 
-    def _farthest(self, ways: Array, points: Mask) -> float:
-        """The largest displacement of some points relative to their facet sizes. Collective."""
-        lengths = np.linalg.norm(ways, axis=1) / self._parts.quadrature.facet_sizes
+    def _largest_ratio(self, displacements: Array, points: Mask) -> float:
+        """Return the largest displacement of some points per facet size. Collective."""
+        lengths = np.linalg.norm(displacements, axis=1) / self._parts.quadrature.facet_sizes
         return global_max(self._mesh.comm, lengths[points])
 
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
-        """See `ContactKinematics`."""
+        """Find the opposite points in a displacement. Collective."""
         self.update_data()
         self._parts.displacement.follow()
         self.pairs.find(self.data.values["x"], self.data.values["normal"], depth, u)
 
-    def resume(self, depth: Array, evaluate: Callable[[], PointValues], *, anew: bool) -> None:
-        """See `ContactKinematics`: the pairs by which points were as deep as that are gone."""
-        if anew:
+    def resume(self, depth: Array, evaluate: Callable[[], PointValues], *, new_pairs: bool) -> None:
+        """Make the present ``u`` the committed displacement of another run. Collective."""
+        if new_pairs:
             self.find_pairs(self._parts.displacement.u, depth)
-        super().resume(depth, evaluate, anew=anew)
-        if anew:  # to the last digit as `commit` has it
+        super().resume(depth, evaluate, new_pairs=new_pairs)
+        if new_pairs:  # with the same round-off as in `commit`
             self.committed_jump = self.present_jump()
 
     def commit(self, values: PointValues) -> Array | None:
-        """See `ContactKinematics`."""
-        due = self.needs_pair_update(values)
+        """Make an evaluated state the committed one; return the change of the jump. Collective."""
+        needs_update = self.needs_pair_update(values)
         super().commit(values)
-        if not due:
+        if not needs_update:
             return None
-        # The traction stays with the points of Γc; what they slip over has moved on.
+        # Tractions are fields of Γc and need no transfer, but the slip reference changes.
         self.find_pairs(self._parts.displacement.u, values.depth)
         return self.update_committed_jump()
 
 
 class BodyFinite(BodySmall):
-    """Another body, wherever both go: pairs of the present places."""
+    """Finite sliding between bodies: the pairs follow the deformed bodies."""
 
     is_finite = True
     follows = True
@@ -168,85 +168,90 @@ class BodyFinite(BodySmall):
         assert isinstance(obstacle, DeformableBody)
         pairs = FiniteSlidingPairs(parts.name, parts.displacement.u, parts.quadrature, obstacle)
         super().__init__(parts, pairs)
-        self._present = pairs
+        self._finite_pairs = pairs
         self.local_jump = pairs.local_jump.function
         self.in_form = self.at_points = FiniteSlidingKinematics(parts.multipliers)
 
     def update(self) -> None:
-        """See `ContactKinematics`."""
+        """Update data, pairs and jump to the present data and ``u``. Collective."""
         self.update_data()
         data, history = self.data.values, self._parts.history
         self._parts.displacement.follow()
-        self._present.follow(data["x"], data["normal"], history, self._parts.multipliers or history)
+        self._finite_pairs.update(
+            data["x"], data["normal"], history, self._parts.multipliers or history
+        )
         self._update_jump()
 
     def outputs(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
-        """Return outputs as `ContactKinematics` does; the jump is zero at the committed state."""
-        pairs, normal = self._present, self._present.local_jump.values("normal")
-        told = self._pair_outputs(arrays) | {"normal": normal, "jump": pairs.jump_since()}
+        """Return the fields of `ContactKinematics.outputs`, with the jump since the last commit."""
+        pairs, normal = self._finite_pairs, self._finite_pairs.local_jump.values("normal")
+        outputs = self._pair_outputs(arrays) | {"normal": normal, "jump": pairs.jump_increment()}
         if not self._parts.law.has_friction:
-            return told
-        told |= self._framed(arrays, normal)
-        old = pairs.turned(self._parts.history.values("traction"))
-        old -= np.sum(old * normal, axis=1)[:, None] * normal
-        return told | {"projection_point": np.zeros_like(normal), "carried_traction": old}
+            return outputs
+        outputs |= self._to_history_frame(arrays, normal)
+        traction = pairs.turned(self._parts.history.values("traction"))
+        traction -= np.sum(traction * normal, axis=1)[:, None] * normal
+        zeros = np.zeros_like(normal)
+        return outputs | {"projection_point": zeros, "carried_traction": traction}
 
     def tangent(self, law: PointLaw) -> PointTangent:
-        """See `ContactKinematics`."""
-        by_felt = law.evaluate_tangent().by_jump
+        """Return the derivatives of the point forces by the local unknowns. Collective."""
+        by_local_jump = law.evaluate_tangent().by_jump
         traction = law.evaluate_traction()
-        return PointTangent(self._present.tangent(by_felt, traction, self._parts.history))
+        return PointTangent(
+            self._finite_pairs.tangent(by_local_jump, traction, self._parts.history)
+        )
 
     def undeformed_gap(self, values: PointValues) -> Array:
-        """See `ContactKinematics`."""
-        return self._present.undeformed_gap
+        """Return the gap of the undeformed Γc, (n_points,) (length)."""
+        return self._finite_pairs.undeformed_gap
 
     def turned(self, vectors: Array, *, back: bool = False) -> Array:
-        """See `ContactKinematics`: of the committed bodies."""
-        return self._present.turned(vectors, back=back)
+        """Return vectors rotated with the surface from the committed state, or back."""
+        return self._finite_pairs.turned(vectors, back=back)
 
     @property
     def updates_pairs(self) -> bool:
-        """See `ContactKinematics`: they are, and wherever else the bodies go."""
+        """Whether pairs are updated, which is always so."""
         return True
 
     @property
     def can_update_pairs(self) -> bool:
-        """See `ContactKinematics`: not at a commit alone, whatever the obstacle says."""
+        """Whether pairs are updated at a commit; here they follow every displacement instead."""
         return False
 
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
-        """See `ContactKinematics`: they are found wherever points are updated."""
+        """Update the points, and the pairs with them. Collective."""
         self.update()
 
     def reset_reference(self) -> bool:
-        """See `ContactKinematics`."""
-        if self._present.is_begun():
+        """Measure slip from the present ``u``; return whether the reference changes. Collective."""
+        if self._finite_pairs.is_at_commit():
             return False
-        self._present.commit()
+        self._finite_pairs.commit()
         return True
 
-    def start(self) -> dict[str, Array]:
-        """See `ContactKinematics`: all is counted from the committed bodies."""
+    def reference_fields(self) -> dict[str, Array]:
+        """Return no fields, because slip is measured from the committed bodies."""
         return {}
 
-    def projection_points(self, values: PointValues) -> dict[str, Array]:
-        """See `ContactKinematics`: the ways in the committed bodies."""
-        return {"jump": self._present.way}
+    def slip_reference(self, values: PointValues) -> dict[str, Array]:
+        """Return V of `finite_sliding` as the reference of slip."""
+        return {"jump": self._finite_pairs.total_slip}
 
-    def committed_fields(self, fields: Mapping[str, Array]) -> dict[str, Array]:
-        """See `ContactKinematics`: vectors turned with the surface."""
-        turned = {n: self.turned(fields[n]) for n in ("traction", "jump") if n in fields}
-        return dict(fields) | turned
+    def to_history(self, fields: Mapping[str, Array]) -> dict[str, Array]:
+        """Return fields of a solution with vectors rotated with the surface."""
+        rotated = {n: self.turned(fields[n]) for n in ("traction", "jump") if n in fields}
+        return dict(fields) | rotated
 
-    def resume(self, depth: Array, evaluate: Callable[[], PointValues], *, anew: bool) -> None:
-        """See `ContactKinematics`."""
-        self._present.commit()
-        super().resume(depth, evaluate, anew=False)
+    def resume(self, depth: Array, evaluate: Callable[[], PointValues], *, new_pairs: bool) -> None:
+        """Make the present ``u`` the committed displacement of another run. Collective."""
+        self._finite_pairs.commit()
+        super().resume(depth, evaluate, new_pairs=False)
 
     def commit(self, values: PointValues) -> Array | None:
-        """See `ContactKinematics`."""
+        """Make an evaluated state the committed one. Collective."""
         super().commit(values)
-        self._present.commit()
+        self._finite_pairs.commit()
         self.committed_jump = np.zeros_like(values.jump)
         return None

@@ -1,4 +1,4 @@
-"""How a contact is taken: kinematics and enforcement, asked for or by what else is given."""
+"""Selection of kinematics and enforcement from the arguments of a `Contact`."""
 
 from __future__ import annotations
 
@@ -13,27 +13,26 @@ from fenics_contact.laws.stiffness import NodalSprings
 from fenics_contact.obstacles.base import Obstacle
 from fenics_contact.obstacles.deformable import DeformableBody
 
-__all__ = ["enforcement_of", "is_regularised", "kinematics_class"]
-
+__all__ = ["is_regularised", "select_enforcement", "select_kinematics"]
 
 _ENFORCEMENTS = ("penalty", "augmented")
 KinematicsClass = type[RigidSmall] | type[BodySmall] | type[RigidFinite]
-# By kinematics, of a rigid obstacle and of another body.
+# The classes for a rigid obstacle and for an opposing body, by kinematics.
 _KINEMATICS: dict[str, tuple[KinematicsClass, KinematicsClass]] = {
     "small": (RigidSmall, BodySmall),
     "finite": (RigidFinite, BodyFinite),
 }
-# Of augmented enforcement, where nothing is said.
-_TOLERANCE = 1e-5
+# Default tolerance of the augmented Lagrangian method.
+_DEFAULT_TOLERANCE = 1e-5
 
 
-def kinematics_class(
+def select_kinematics(
     name: str, kinematics: str, obstacle: Obstacle, law: Law, gap: Any
 ) -> KinematicsClass:
-    """What lies opposite, by what was given to `Contact`: a class that is made of `ContactParts`.
+    """Return the `ContactKinematics` class for the arguments of a `Contact`.
 
     Raises:
-        ValueError: ``kinematics`` is unknown, or something was given that has no sense with it.
+        ValueError: ``kinematics`` is unknown, or an argument is not available with it.
     """
     if kinematics not in _KINEMATICS:
         raise ValueError(
@@ -41,15 +40,15 @@ def kinematics_class(
             "tolerance of small displacements is ContactProblem(small_displacement_tolerance=...))"
         )
     rigid, body = _KINEMATICS[kinematics]
-    found = body if isinstance(obstacle, DeformableBody) else rigid
-    if not found.is_finite:
+    kinematics_type = body if isinstance(obstacle, DeformableBody) else rigid
+    if not kinematics_type.is_finite:
         if obstacle.rotation is not None:
             raise ValueError(
                 f'{name}: a Rotation of the obstacle needs Contact(kinematics="finite"); for '
                 "rotations below 0.01 rad you may give the displacement as a UFL vector instead, "
                 "with a relative error of the forces of about the angle"
             )
-        return found
+        return kinematics_type
     if gap is not None:
         raise ValueError(
             f"{name}: gap is given, but with finite kinematics it follows from the positions of "
@@ -60,27 +59,27 @@ def kinematics_class(
             f"{name}: {type(law).__name__} bonds points to fixed points of the obstacle, which is "
             "not available with finite kinematics; use a law with friction, or omit k_t"
         )
-    return found
+    return kinematics_type
 
 
 def is_regularised(law: Law) -> bool:
-    """Whether the stiffness stands for none at all, and is not that of physical springs."""
+    """Whether the stiffness regularises rigid contact, and is not that of physical springs."""
     springs = (isinstance(v, NodalSprings) for v in law.parameters().values())
     return not law.is_physical and not any(springs)
 
 
-def enforcement_of(
-    name: str, enforcement: str | None, tolerance: float | None, law: Law, chosen: Accuracy | None
+def select_enforcement(
+    name: str, enforcement: str | None, tolerance: float | None, law: Law, accuracy: Accuracy | None
 ) -> tuple[bool, float]:
-    """Whether there are multipliers, and the tolerance, by what was given to `Contact`.
+    """Return whether there are multipliers, and the tolerance, for the arguments of a `Contact`.
 
     Raises:
-        ValueError: The law has no use for them, or the tolerance is none.
+        ValueError: An argument is invalid, or the law has a physical stiffness.
     """
     if enforcement is None:
-        enforcement = chosen.enforcement if chosen and is_regularised(law) else "penalty"
+        enforcement = accuracy.enforcement if accuracy and is_regularised(law) else "penalty"
     if tolerance is None:
-        tolerance = chosen.tolerance if chosen else _TOLERANCE
+        tolerance = accuracy.tolerance if accuracy else _DEFAULT_TOLERANCE
     if enforcement not in _ENFORCEMENTS:
         raise ValueError(f"{name}: enforcement is {enforcement!r}; use one of {_ENFORCEMENTS}")
     if not (is_number(tolerance) and 0.0 < tolerance < 1.0):
@@ -89,9 +88,9 @@ def enforcement_of(
         return False, tolerance
     if not is_regularised(law):
         springs = [n for n, v in law.parameters().items() if isinstance(v, NodalSprings)]
-        what = f"{springs[0]} by NodalSprings" if springs else type(law).__name__
+        term = f"{springs[0]} by NodalSprings" if springs else type(law).__name__
         raise ValueError(
-            f"{name}: {what} has a physical stiffness, which the augmented Lagrangian method would "
+            f"{name}: {term} has a physical stiffness, which the augmented Lagrangian method would "
             'eliminate; use enforcement="penalty", or a law and stiffness that regularise rigid '
             "contact"
         )

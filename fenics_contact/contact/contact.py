@@ -11,10 +11,10 @@ from dolfinx import fem
 
 from fenics_contact.arguments import check_instance
 from fenics_contact.contact.accuracy import Accuracy
-from fenics_contact.contact.choices import enforcement_of, kinematics_class
+from fenics_contact.contact.choices import select_enforcement, select_kinematics
 from fenics_contact.contact.contact_kinematics import ContactKinematics, ContactParts
 from fenics_contact.contact.effective_law import EffectiveLaw
-from fenics_contact.contact.inputs import Inputs, varies
+from fenics_contact.contact.inputs import Inputs, is_varying
 from fenics_contact.contact.multipliers import Multipliers, TraceProjection
 from fenics_contact.contact.results import PointResults
 from fenics_contact.contact.states import ContactStates
@@ -152,15 +152,17 @@ class Contact(PointResults):
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
         self.accuracy = None if accuracy is None else Accuracy.of(accuracy)
-        kinematics_type = kinematics_class(name, kinematics, obstacle, law, gap)
+        kinematics_type = select_kinematics(name, kinematics, obstacle, law, gap)
         self.kinematics, self.finite = kinematics, kinematics_type.is_finite
-        augments, self.tolerance = enforcement_of(name, enforcement, tolerance, law, self.accuracy)
+        augments, self.tolerance = select_enforcement(
+            name, enforcement, tolerance, law, self.accuracy
+        )
         # Linear elements meet a curved gap at their nodes only (docs/enforcement.md). But between
         # two meshes, and on quadrilaterals of any shape, nodes do not transfer a uniform pressure.
         nodal = augments and degree == 1 and not isinstance(obstacle, DeformableBody)
         nodal = nodal and surface.submesh.topology.cell_name() != "quadrilateral"
         # Nor with a weight that varies, where vertex areas do not integrate a uniform pressure.
-        nodal = nodal and not varies(weight)
+        nodal = nodal and not is_varying(weight)
         opposite = None
         if isinstance(obstacle, DeformableBody):
             opposite = tagged_facets(surface.mesh, obstacle.facet_tags, obstacle.tags)

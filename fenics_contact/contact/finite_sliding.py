@@ -132,7 +132,7 @@ class FiniteSlidingPairs(Pairs):
     def _find(self, history: PointFields) -> None:
         """The partners at the present displacement. Collective."""
         assert self._where is not None and self._at_rest is not None
-        assert self.search is not None and self.acts is not None
+        assert self.search is not None and self.indicator is not None
         here, facet, (place, undeformed) = self._rays.here.facets, self._rays.facet, self._where
         if self._committed is None:
             x, tangents = here.positions(facet, place, self._before)
@@ -165,7 +165,7 @@ class FiniteSlidingPairs(Pairs):
             self._warn_of_unpaired(hits.reason)
         self._local = None
 
-    def jump_since(self) -> Array:
+    def jump_increment(self) -> Array:
         """Displacement relative to the partner since the last commit, (n_points, d). Collective."""
         change = self._u.copy()
         change.x.array[:] -= self._before.x.array
@@ -212,7 +212,7 @@ class FiniteSlidingPairs(Pairs):
     def _forget(self) -> None:
         self._committed = self._present = None
 
-    def is_begun(self) -> bool:
+    def is_at_commit(self) -> bool:
         """Whether the present displacement is the committed one. Collective."""
         change = np.abs(self._u.x.array - self._before.x.array)
         return not global_max(self._mesh.comm, change) > 0

@@ -27,7 +27,7 @@ from fenics_contact.surface.surface import SurfaceQuadrature, VertexAreas
 from fenics_contact.tolerances import FLAT, ROUND_OFF
 from fenics_contact.types import Array, Indices
 
-__all__ = ["FreeMotion", "Inputs", "check_given", "varies"]
+__all__ = ["FreeMotion", "Inputs", "check_data", "is_varying"]
 
 
 logger = logging.getLogger("fenics_contact")
@@ -420,7 +420,7 @@ class Inputs:
             )
 
 
-def varies(value: Any) -> bool:
+def is_varying(value: Any) -> bool:
     """Whether a number or UFL may differ from place to place."""
     if not isinstance(value, ufl.core.expr.Expr):
         return False
@@ -428,7 +428,7 @@ def varies(value: Any) -> bool:
     return any(isinstance(item, places) for item in traverse_unique_terminals(value))
 
 
-def check_given(
+def check_data(
     name: str,
     given: Mapping[str, Any],
     quadrature: SurfaceQuadrature,

@@ -30,7 +30,7 @@ class PairsState:
     n_unpaired: int
     distance: Array
     found_at: fem.Function | None
-    found_jump: Array | None
+    pairing_jump: Array | None
 
 
 class Pairs:
@@ -69,14 +69,14 @@ class Pairs:
         self.n_unpaired = self.number = 0
         self.search: Pairing | None = None
         self.distance: fem.Function | None = None
-        self.acts: fem.Function | None = None
+        self.indicator: fem.Function | None = None
         self.found_at: fem.Function | None = None
-        self.found_jump: Array | None = None
+        self.pairing_jump: Array | None = None
         self.degenerate = False
         if isinstance(obstacle, DeformableBody):
             self.search = Pairing(obstacle, quadrature, u.function_space)
             self.distance = fem.Function(quadrature.space(), name="distance")
-            self.acts = fem.Function(quadrature.space(), name="paired")
+            self.indicator = fem.Function(quadrature.space(), name="paired")
 
     def find(self, x: Array, normal: Array, depth: Array, u: fem.Function | None) -> None:
         """Find the opposites of all points; those without one are open. Collective.
@@ -87,22 +87,22 @@ class Pairs:
             depth: How deep the points are in the opposite in ``u``, (n_points,) (length).
             u: Displacement in which to find them; None: the undeformed bodies.
         """
-        assert self.search and self.distance and self.acts
+        assert self.search and self.distance and self.indicator
         opposite, self.opposite_map, distance, why = self.search.pair(x, normal, u, depth)
         self.distance.x.array[: len(distance)] = np.nan_to_num(distance)
         self.distance.x.scatter_forward()
         self._set_pairs(opposite, ~np.isnan(distance))
         self.found_at = None if u is None else u.copy()
-        self.found_jump = None if u is None else self._product(self.jump_map, u)
+        self.pairing_jump = None if u is None else self._product(self.jump_map, u)
         if self.number == 1:  # of bodies that slide off each other more and more have none
             self._warn_of_unpaired(why)
 
     def _set_pairs(self, opposite: PETSc.Mat, paired: Mask) -> None:
         """Take the map to what is opposite (used up), and which points have it. Collective."""
-        assert self.acts
+        assert self.indicator
         self.paired = paired
-        self.acts.x.array[: len(paired)] = paired
-        self.acts.x.scatter_forward()
+        self.indicator.x.array[: len(paired)] = paired
+        self.indicator.x.scatter_forward()
         relative = self.own_map.copy()
         mask = relative.createVecLeft()
         mask.array[:] = np.repeat(self.paired, self._gdim)
@@ -131,21 +131,21 @@ class Pairs:
     def state(self) -> PairsState:
         """The pairs as they are; what is found later does not change it."""
         distance = np.zeros(0) if self.distance is None else self.distance.x.array.copy()
-        maps, found = (self.jump_map, self.opposite_map), (self.found_at, self.found_jump)
+        maps, found = (self.jump_map, self.opposite_map), (self.found_at, self.pairing_jump)
         return PairsState(*maps, self.paired, self.n_unpaired, distance, *found)
 
     def set_state(self, state: PairsState) -> None:
         """Put back what `state` gave. Collective."""
         if self.jump_map is state.jump_map:
             return
-        assert self.distance and self.acts
+        assert self.distance and self.indicator
         self.jump_map, self.opposite_map = state.jump_map, state.opposite_map
         self.paired, self.n_unpaired = state.paired, state.n_unpaired
-        self.found_at, self.found_jump = state.found_at, state.found_jump
+        self.found_at, self.pairing_jump = state.found_at, state.pairing_jump
         self.number += 1  # what was made of the pairs in between is of others
         self.distance.x.array[:] = state.distance
-        self.acts.x.array[: self._quadrature.n_points] = self.paired
-        self.acts.x.scatter_forward()
+        self.indicator.x.array[: self._quadrature.n_points] = self.paired
+        self.indicator.x.scatter_forward()
 
     @property
     def reach(self) -> PETSc.Mat:
@@ -166,7 +166,7 @@ class Pairs:
         depth = normal_displacement - self.distance.x.array[: self._quadrature.n_points]
         return np.where(self.paired, np.maximum(depth, 0.0), 0.0)
 
-    def moved_since_found(self) -> Array:
+    def displacement_since_pairing(self) -> Array:
         """How far points have moved relative to the surface opposite since pairs were found.
 
         Collective. That of the surface is the mean of its nodes.

@@ -79,13 +79,13 @@ class PointLaw:
         quadrature: SurfaceQuadrature,
         jump: fem.Function,
         *,
-        acts: Any,
+        mask: Any,
         given: PointGeometry,
         free: Mapping[int, Any],
     ) -> None:
         self.law, self.geometry = law, geometry
         self._kinematics, self._quadrature, self._jump = kinematics, quadrature, jump
-        self._acts, self._given, self._free = acts, given, free
+        self._mask, self._given, self._free = mask, given, free
         self._gdim = quadrature.surface.mesh.geometry.dim
 
     def with_law(self, law: Law, parameters: Mapping[str, Any]) -> PointLaw:
@@ -96,7 +96,7 @@ class PointLaw:
             self._kinematics,
             self._quadrature,
             self._jump,
-            acts=self._acts,
+            mask=self._mask,
             given=self._given,
             free=self._free,
         )
@@ -105,7 +105,7 @@ class PointLaw:
 
     def _there(self, value: Any) -> Any:
         """A value at points at which the law acts, 0 at the others; None stays None."""
-        return value if self._acts is None or value is None else self._acts * value
+        return value if self._mask is None or value is None else self._mask * value
 
     def _point_kinematics(
         self, jump: Any = None, geometry: PointGeometry | None = None
@@ -305,8 +305,8 @@ class PointLaw:
         gap = ufl.variable(felt.gap)
         at_variable = replace(felt, gap=gap)
         # Where nothing acts the stiffness is that of a point that has just closed.
-        acts = ufl.ne(response.normal_traction, 0)
-        at_closed = replace(felt, gap=ufl.conditional(acts, felt.gap, -self._barely))
+        mask = ufl.ne(response.normal_traction, 0)
+        at_closed = replace(felt, gap=ufl.conditional(mask, felt.gap, -self._barely))
         return {
             "normal_reaction": ufl.diff(law.normal_potential(at_variable, parameters), gap),
             "normal_stiffness": law.normal_stiffness(at_closed, parameters),

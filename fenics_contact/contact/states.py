@@ -122,7 +122,7 @@ class ContactStates:
         """Make the present ``u`` the state before the first increment. Collective."""
         if self._law.has_friction:
             start = {name: self.history.values(name) for name in self.history.names}
-            self.history.assign(start | self._opposite.start())
+            self.history.assign(start | self._opposite.reference_fields())
         self.set_state(ContactState(self.history.rows(), self._opposite.state()))
 
     def begin_between(self, opposite: KinematicsState) -> None:
@@ -151,8 +151,8 @@ class ContactStates:
             return
         points = points & (self.history.values("normal_traction") == 0.0)
         kept = {name: self.history.values(name) for name in self.history.names}
-        projection_points = self._opposite.projection_points(self.values)
-        counted = {n: np.where(points[:, None], v, kept[n]) for n, v in projection_points.items()}
+        slip_reference = self._opposite.slip_reference(self.values)
+        counted = {n: np.where(points[:, None], v, kept[n]) for n, v in slip_reference.items()}
         self.history.assign(kept | counted)
         self.forget()
 
@@ -176,7 +176,7 @@ class ContactStates:
             }
         if self._multipliers is not None:
             values |= self._multipliers.committed(points)
-        history = self._opposite.committed_fields(values)
+        history = self._opposite.to_history(values)
         return ContactTrial(points, history, self.history.rows(), self._opposite.state())
 
     def commit(self, trial: ContactTrial | None = None) -> None:
@@ -242,7 +242,7 @@ class ContactStates:
             return self.values
 
         unknown = np.zeros(len(self.history.rows()))
-        self._opposite.resume(values.get("depth", unknown), present, anew=anew)
+        self._opposite.resume(values.get("depth", unknown), present, new_pairs=anew)
         points = self.values
         shapes = {n: v.shape for n, v in points.arrays.items()}
         if {n: v.shape for n, v in values.items()} == shapes:
