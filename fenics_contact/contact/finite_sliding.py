@@ -1,20 +1,21 @@
-"""What points of Γc feel of a body that deforms as far as theirs: pairs at the present places.
+"""Finite sliding between deformable bodies: kinematics at the points of Γc, eq. (3).
 
-A point X of Γc, now at x = X + u, looks along its present normal n and meets its partner y of the
-opposite surface, x + g n = y; g is the gap. Integrals are over the undeformed Γc, and a point's
-traction T acts on the partner as -T: the virtual work is -∫ T·(v(X) - v(Y)).
+A point X of Γc, now at x = X + u, has the opposite point y on its present normal n: x + g n = y
+with the gap g. Integrals are over the undeformed Γc, and the traction T of a point acts on the
+master as -T: the virtual work is -∫ T·(v(X) - v(Y)).
 
-With w the displacement at the last commit, n₀ the normal and y_w the partner then,
+With the displacement w at the last commit, and the normal n₀ and the position y_w of the present
+opposite point at that time, the total slip
 
     V = y_w - (X + w(X) + g n₀)
 
-is the way in the committed bodies from where the point looked to where its present partner was: the
-slip. It needs no history of partners, and a rigid motion of both bodies does not change it. V and
-the committed traction are turned by R, the rotation of the surface from its committed tangents and
-normal to the present ones (that of the polar decomposition, the turn about the normal included).
+is the distance in the committed bodies from the ray of the point to its present opposite point. It
+needs no history of the pairs and is invariant to rigid-body motions of both bodies together. V and
+the committed traction are rotated by R, the rotation in the polar decomposition of the surface's
+deformation since the commit, from its committed tangents and normal to the present ones.
 
-Of a point's 2 d² local unknowns q = (u(X), ∂u(X), u(Y), ∂u(Y)), ∂ along the surfaces, all of these
-follow: the derivative by all unknowns is C by q, point by point, between sparse maps to q.
+All of these are functions of the 2 d² local unknowns q = (u(X), ∂u(X), u(Y), ∂u(Y)) of the point, ∂
+along the surfaces: the tangent is a matrix by q, point by point, between sparse maps to q.
 """
 
 from __future__ import annotations
@@ -46,12 +47,12 @@ __all__ = ["FiniteSlidingKinematics", "FiniteSlidingPairs"]
 
 @dataclass(frozen=True)
 class _Committed:
-    """Γc in the bodies as they were committed, at its points.
+    """Γc at the committed displacement.
 
     Attributes:
-        x: Places, (n_points, d) (length).
-        normal: (n_points, d).
-        along: Reciprocals of the tangents, across the normal, (n_points, d, d - 1) (1/length).
+        x: Positions of the points, (n_points, d) (length).
+        normal: Unit normals, (n_points, d).
+        along: Dual tangent vectors a^α, (n_points, d, d - 1) (1/length).
     """
 
     x: Array
@@ -61,35 +62,35 @@ class _Committed:
 
 @dataclass(frozen=True)
 class _Present:
-    """Γc and its partners at the present displacement, at its points.
+    """Γc and the opposite points at the present displacement.
 
     Attributes:
-        along: As in `_Committed`.
-        normal: (n_points, d).
-        gap: Along it, (n_points,) (length); 0 without a partner.
-        hits: What was met.
-        way: V, (n_points, d) (length).
+        along: Dual tangent vectors a^α, (n_points, d, d - 1) (1/length).
+        normal: Unit normals, (n_points, d).
+        gap: Gap along the normal, (n_points,) (length); 0 at unpaired points.
+        hits: Intersections of the normals with the opposing surface.
+        total_slip: V, (n_points, d) (length).
         rotation: R, (n_points, d, d).
-        stretch: Of the surface from the committed to the present one, Rᵀ F, (n_points, d, d).
+        stretch: Stretch Rᵀ F of the surface since the commit, (n_points, d, d).
     """
 
     along: Array
     normal: Array
     gap: Array
     hits: Hits
-    way: Array
+    total_slip: Array
     rotation: Array
     stretch: Array
 
 
 class FiniteSlidingPairs(Pairs):
-    """Pairs that follow the bodies: found anew wherever the displacement has changed.
+    """Pairs that follow the bodies: they are found again whenever the displacement changes.
 
-    The constructor is collective, and collects the surfaces; `follow` finds the pairs.
+    The constructor is collective, and collects the surfaces; `update` finds the pairs.
 
     Attributes:
-        felt: What laws see: "gap" (length), "normal", "slip" R (V - history) (length), "traction"
-            from which the law's return map starts (stress).
+        local_jump: Independent variables of the laws: "gap" (length), "normal", "slip" R (V -
+            history) (length), and "traction", from which the return map starts (stress).
     """
 
     def __init__(
@@ -99,261 +100,271 @@ class FiniteSlidingPairs(Pairs):
         assert self.search is not None
         self._rays = self.search.rays
         d = self._gdim
-        self._before = u.copy()
+        self._committed_u = u.copy()
         self.local_jump = PointFields(quadrature, {"gap": 0, "normal": d, "slip": d, "traction": d})
-        self._where: tuple[Array, Array] | None = None
-        self._at_rest: tuple[Array, Array] | None = None
+        self._reference: tuple[Array, Array] | None = None
+        self._undeformed: tuple[Array, Array] | None = None
         self._committed: _Committed | None = None
         self._present: _Present | None = None
-        self._at: Array | None = None
-        self._local: PETSc.Mat | None = None
+        self._last_u: Array | None = None
+        self._local_map: PETSc.Mat | None = None
 
-    def follow(self, x: Array, normal: Array, history: PointFields, traction: PointFields) -> None:
-        """Find the partners at the present displacement, and what follows from it. Collective.
+    def update(self, x: Array, normal: Array, history: PointFields, traction: PointFields) -> None:
+        """Find the opposite points at the present displacement; update `local_jump`. Collective.
 
         Args:
-            x: Places of the points in the undeformed body, (n_points, d).
-            normal: Of the undeformed Γc there.
+            x: Undeformed positions of the points, (n_points, d).
+            normal: Normals of the undeformed Γc, (n_points, d).
             history: The committed state.
-            traction: That, or multipliers: what the return map starts from.
+            traction: The fields from which the return map starts, history or multipliers.
         """
-        if self._where is None:
+        if self._reference is None:
             assert self.search is not None
             place = self.search.located(x)
-            self._where = place, normal
-            met, deep = self.search.at_rest(place, x, normal)
-            self._at_rest = np.nan_to_num(met.distance), deep
-        changed = self._at is None or not np.array_equal(self._at, self._u.x.array)
+            self._reference = place, normal
+            hits, penetration_bound = self.search.at_rest(place, x, normal)
+            self._undeformed = np.nan_to_num(hits.distance), penetration_bound
+        changed = self._last_u is None or not np.array_equal(self._last_u, self._u.x.array)
         if self._mesh.comm.allreduce(int(changed)) or self._present is None:
-            self._at = self._u.x.array.copy()
+            self._last_u = self._u.x.array.copy()
             self._find(history)
-        self._feel(history, traction)
+        self._update_local_jump(history, traction)
 
     def _find(self, history: PointFields) -> None:
-        """The partners at the present displacement. Collective."""
-        assert self._where is not None and self._at_rest is not None
+        """Find the opposite points at the present displacement. Collective."""
+        assert self._reference is not None and self._undeformed is not None
         assert self.search is not None and self.indicator is not None
-        here, facet, (place, undeformed) = self._rays.here.facets, self._rays.facet, self._where
+        slave, facet = self._rays.here.facets, self._rays.facet
+        place, undeformed = self._reference
         if self._committed is None:
-            x, tangents = here.positions(facet, place, self._before)
-            normal = here.outward_normals(facet, tangents)
+            x, tangents = slave.positions(facet, place, self._committed_u)
+            normal = slave.outward_normals(facet, tangents)
             self._committed = _Committed(x, normal, _reciprocal(tangents)[0])
-        before = self._committed
-        _, tangents = here.positions(facet, place, self._u)
-        along, spans = _reciprocal(tangents)
-        self.degenerate = bool(self._mesh.comm.allreduce(int(not spans.all())))
-        normal = here.outward_normals(facet, tangents)
-        deep = self.search.largest(history.values("penetration"))
-        if not global_max(self._mesh.comm, np.abs(self._before.x.array)) > 0:
-            deep = np.maximum(deep, self._at_rest[1])
+        committed = self._committed
+        _, tangents = slave.positions(facet, place, self._u)
+        along, is_plane = _reciprocal(tangents)
+        self.degenerate = bool(self._mesh.comm.allreduce(int(not is_plane.all())))
+        normal = slave.outward_normals(facet, tangents)
+        penetration_bound = self.search.largest(history.values("penetration"))
+        if not global_max(self._mesh.comm, np.abs(self._committed_u.x.array)) > 0:
+            penetration_bound = np.maximum(penetration_bound, self._undeformed[1])
         hits = self._rays.follow(
-            facet, place, normal, self._u, deep, undeformed=undeformed, before=self._before
+            facet,
+            place,
+            normal,
+            self._u,
+            penetration_bound,
+            undeformed=undeformed,
+            before=self._committed_u,
         )
         paired = hits.facet >= 0
-        # Of bodies that touch the half of the points would be closed by round-off.
-        apart = paired & ~(np.abs(hits.distance) <= self.search.round_off)
-        gap = np.where(apart, hits.distance, 0.0)
-        way = hits.partner.before - before.x - gap[:, None] * before.normal
-        way[~paired] = 0.0
-        gradient = np.einsum("qia,qja->qij", tangents, before.along)
-        gradient += normal[:, :, None] * before.normal[:, None, :]
-        rotation = _polar(gradient)
+        # Of bodies in contact without pressure, round-off would close half of the points.
+        is_distant = paired & ~(np.abs(hits.distance) <= self.search.round_off)
+        gap = np.where(is_distant, hits.distance, 0.0)
+        total_slip = hits.partner.before - committed.x - gap[:, None] * committed.normal
+        total_slip[~paired] = 0.0
+        gradient = np.einsum("qia,qja->qij", tangents, committed.along)
+        gradient += normal[:, :, None] * committed.normal[:, None, :]
+        rotation = _polar_rotation(gradient)
         stretch = np.einsum("qji,qjk->qik", rotation, gradient)
-        self._present = _Present(along, normal, gap, hits, way, rotation, stretch)
+        self._present = _Present(along, normal, gap, hits, total_slip, rotation, stretch)
         self._set_pairs(hits.matrix(self._u.function_space), paired)
         if self.number == 1:
             self._warn_of_unpaired(hits.reason)
-        self._local = None
+        self._local_map = None
 
     def jump_increment(self) -> Array:
-        """Displacement relative to the partner since the last commit, (n_points, d). Collective."""
-        change = self._u.copy()
-        change.x.array[:] -= self._before.x.array
-        return self._product(self.jump_map, change)
+        """Return the jump since the last commit between the present pairs. Collective."""
+        increment = self._u.copy()
+        increment.x.array[:] -= self._committed_u.x.array
+        return self._product(self.jump_map, increment)
 
-    def _feel(self, history: PointFields, traction: PointFields) -> None:
-        """What laws see, by the tractions to start from as they are. Collective."""
+    def _update_local_jump(self, history: PointFields, traction: PointFields) -> None:
+        """Update `local_jump` from the present pairs and the initial tractions. Collective."""
         assert self._present is not None
-        now = self._present
-        slip, start = np.zeros_like(now.normal), np.zeros_like(now.normal)
+        present = self._present
+        slip, start = np.zeros_like(present.normal), np.zeros_like(present.normal)
         if "traction" in history:
-            slip = self.turned(now.way - history.values("jump"))
+            slip = self.turned(present.total_slip - history.values("jump"))
             start = self.turned(traction.values("traction"))
-        values = {"gap": now.gap, "normal": now.normal, "slip": slip, "traction": start}
-        self.local_jump.assign(values)
+        fields = {"gap": present.gap, "normal": present.normal, "slip": slip, "traction": start}
+        self.local_jump.assign(fields)
 
     @cached_property
     def reach(self) -> PETSc.Mat:
-        """The nodes on the facets of both surfaces, facet by facet; see `Pairs.reach`."""
+        """Map from ``u`` to the nodes on the facets of both surfaces. Collective."""
         assert self.search is not None
         space, sides = self._u.function_space, (self._rays.here, self._rays.there)
         local = np.concatenate([side.facets.nodes for side in sides])
         nodes = space.dofmap.index_map.local_to_global(local.ravel().astype(np.int32))
-        every, nodes = np.arange(len(local)), nodes.reshape(local.shape)
-        return interpolation_matrix(space, len(local), every, nodes, np.ones(local.shape))
+        all_rows, nodes = np.arange(len(local)), nodes.reshape(local.shape)
+        return interpolation_matrix(space, len(local), all_rows, nodes, np.ones(local.shape))
 
     @property
-    def way(self) -> Array:
-        """V, (n_points, d) (length); see the module."""
+    def total_slip(self) -> Array:
+        """Total slip V, (n_points, d) (length)."""
         assert self._present is not None
-        return self._present.way.copy()
+        return self._present.total_slip.copy()
 
     def turned(self, vectors: Array, *, back: bool = False) -> Array:
-        """Vectors of the committed bodies as they have turned since, or back, (n_points, d)."""
+        """Return vectors rotated by R from the committed bodies, or back, (n_points, d)."""
         assert self._present is not None
-        way = "qij,qi->qj" if back else "qij,qj->qi"
-        return np.asarray(np.einsum(way, self._present.rotation, vectors))
+        subscripts = "qij,qi->qj" if back else "qij,qj->qi"
+        return np.asarray(np.einsum(subscripts, self._present.rotation, vectors))
 
     def commit(self) -> None:
         """Make the present displacement the committed one."""
-        self._before.x.array[:] = self._u.x.array
-        self._forget()
+        self._committed_u.x.array[:] = self._u.x.array
+        self._reset()
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         self._committed = self._present = None
 
     def is_at_commit(self) -> bool:
         """Whether the present displacement is the committed one. Collective."""
-        change = np.abs(self._u.x.array - self._before.x.array)
-        return not global_max(self._mesh.comm, change) > 0
+        increment = np.abs(self._u.x.array - self._committed_u.x.array)
+        return not global_max(self._mesh.comm, increment) > 0
 
     def state(self) -> PairsState:
-        """See `Pairs.state`: all follows from the committed displacement."""
-        found = np.zeros(0), self._before.copy(), None
-        return PairsState(self.jump_map, None, self.paired, self.n_unpaired, *found)
+        """Return the committed displacement, from which the pairs follow."""
+        pairing = np.zeros(0), self._committed_u.copy(), None
+        return PairsState(self.jump_map, None, self.paired, self.n_unpaired, *pairing)
 
     def set_state(self, state: PairsState) -> None:
-        """See `Pairs.set_state`."""
+        """Restore the committed displacement from `state`. Collective."""
         assert state.found_at is not None
-        self._before.x.array[:] = state.found_at.x.array
-        self._forget()
+        self._committed_u.x.array[:] = state.found_at.x.array
+        self._reset()
 
     @property
     def undeformed_gap(self) -> Array:
-        """See `ContactKinematics.undeformed_gap`."""
-        assert self._at_rest is not None
-        return self._at_rest[0]
+        """Gap of the undeformed Γc, 0 at unpaired points, (n_points,) (length)."""
+        assert self._undeformed is not None
+        return self._undeformed[0]
 
     def true_gap(self, values: PointValues) -> tuple[Array, Array]:
-        """See `ContactKinematics.true_placement`: it is that of the pairs themselves."""
+        """Return gap and normal of the pairs, which are at X + u. Collective."""
         return np.where(self.paired, values.gap, np.nan), values.normal.copy()
 
     # ---- derivatives -----------------------------------------------------------------------------
 
     @property
     def local_map(self) -> PETSc.Mat:
-        """From ``u`` to the local unknowns of the points, (2 d² n_points, n_dofs). Collective."""
-        if self._local is None:
-            self._local = self._make_local_map()
-        return self._local
+        """Map from ``u`` to the local unknowns, (2 d² n_points, n_dofs). Collective."""
+        if self._local_map is None:
+            self._local_map = self._make_local_map()
+        return self._local_map
 
     def _make_local_map(self) -> PETSc.Mat:
-        assert self._where is not None and self._present is not None
-        here, facet, place = self._rays.here.facets, self._rays.facet, self._where[0]
+        assert self._reference is not None and self._present is not None
+        slave, facet, place = self._rays.here.facets, self._rays.facet, self._reference[0]
         space, d, n = self._u.function_space, self._gdim, len(place)
         partner = self._present.hits.partner
-        nodes, weights = here.interpolation(facet, place)
-        # (n, 2 d) functionals of each component, own before the partner's.
+        nodes, weights = slave.interpolation(facet, place)
+        # (n, 2 d) functionals of each component: value and slopes of the slave, then the master.
         values = np.concatenate([weights, partner.weights], axis=1)
-        at = np.concatenate(
+        all_nodes = np.concatenate(
             [np.broadcast_to(v[:, None], (n, d, v.shape[1])) for v in (nodes, partner.nodes)],
             axis=1,
         )
         bs = space.dofmap.bs
         values = np.repeat(values[:, :, None], d, axis=2)
-        columns = at[:, :, None] * bs + np.arange(d)[None, None, :, None]
-        kept = np.abs(values) > ROUND_OFF
-        pointers = np.concatenate([[0], np.cumsum(kept.sum(axis=3).ravel())])
+        columns = all_nodes[:, :, None] * bs + np.arange(d)[None, None, :, None]
+        is_nonzero = np.abs(values) > ROUND_OFF
+        pointers = np.concatenate([[0], np.cumsum(is_nonzero.sum(axis=3).ravel())])
         n_columns = space.dofmap.index_map.size_local * bs
-        return sparse_matrix(space.mesh.comm, n_columns, pointers, columns[kept], values[kept])
+        return sparse_matrix(
+            space.mesh.comm, n_columns, pointers, columns[is_nonzero], values[is_nonzero]
+        )
 
-    def tangent(self, by_felt: Array, traction: Array, history: PointFields) -> Array:
-        """Derivative of the point's forces on its local unknowns by these.
+    def tangent(self, by_local_jump: Array, traction: Array, history: PointFields) -> Array:
+        """Return the derivative of the point forces by the local unknowns.
 
         Args:
-            by_felt: Derivative of the traction by `felt`, (n_points, d, 1 + 3 d).
-            traction: On the body, (n_points, d) (stress).
+            by_local_jump: Derivative of the traction by `local_jump`, (n_points, d, 1 + 3 d).
+            traction: Traction on the body, (n_points, d) (stress).
             history: The committed state.
 
         Returns:
-            (n_points, 2 d², 2 d²): rows of u(X) and u(Y) by what of the traction changes, those of
-            ∂u(Y) by how the partner moves along its surface.
+            (n_points, 2 d², 2 d²): rows of u(X) and u(Y) with the variation of the traction, rows
+            of ∂u(Y) with the motion of the opposite point along its surface.
         """
         assert self._present is not None and self._committed is not None
-        now, before, d = self._present, self._committed, self._gdim
-        n, m = len(now.gap), 2 * d * d
-        partner = now.hits.partner
-        own, slopes = slice(0, d), slice(d, d * d)
-        other, other_slopes = slice(d * d, d * d + d), slice(d * d + d, m)
+        present, committed, d = self._present, self._committed, self._gdim
+        n, m = len(present.gap), 2 * d * d
+        partner = present.hits.partner
+        slave_rows, slave_slopes = slice(0, d), slice(d, d * d)
+        master_rows, master_slopes = slice(d * d, d * d + d), slice(d * d + d, m)
         # δn = -a^α (n·δa_α)
         normal = np.zeros((n, d, m))
-        across = -np.einsum("qia,qk->qiak", now.along, now.normal)
-        normal[:, :, slopes] = across.reshape(n, d, d * (d - 1))
+        normal_by_slopes = -np.einsum("qia,qk->qiak", present.along, present.normal)
+        normal[:, :, slave_slopes] = normal_by_slopes.reshape(n, d, d * (d - 1))
         # a_α δξ_α - n δg = δu(X) + g δn - δu(Y)
-        right = now.gap[:, None, None] * normal
-        right[:, :, own] += np.eye(d)
-        right[:, :, other] -= np.eye(d)
-        system = np.concatenate([partner.tangents, -now.normal[:, :, None]], axis=2)
-        system[(now.hits.facet < 0) | ~_metric(system)[1]] = np.eye(d)
+        right = present.gap[:, None, None] * normal
+        right[:, :, slave_rows] += np.eye(d)
+        right[:, :, master_rows] -= np.eye(d)
+        system = np.concatenate([partner.tangents, -present.normal[:, :, None]], axis=2)
+        system[(present.hits.facet < 0) | ~_unit_gram(system)[1]] = np.eye(d)
         solved = np.linalg.solve(system, right)
         slide, gap = solved[:, :-1], solved[:, -1]
-        way = np.einsum("qia,qam->qim", partner.tangents_before, slide)
-        way -= before.normal[:, :, None] * gap[:, None, :]
+        slip_variation = np.einsum("qia,qam->qim", partner.tangents_before, slide)
+        slip_variation -= committed.normal[:, :, None] * gap[:, None, :]
         parts = [gap[:, None], normal]
         if "traction" in history:
-            ways = now.way - history.values("jump")
-            started = np.einsum("qji,qj->qi", now.rotation, self.local_jump.values("traction"))
-            turns = self._spin(normal, slopes)
-            for vector, change in ((ways, way), (started, np.zeros_like(way))):
-                moved = change + _crossed(turns, vector)
-                parts.append(np.einsum("qij,qjm->qim", now.rotation, moved))
+            slip = present.total_slip - history.values("jump")
+            start = np.einsum("qji,qj->qi", present.rotation, self.local_jump.values("traction"))
+            spin = self._rotation_variation(normal, slave_slopes)
+            zeros = np.zeros_like(slip_variation)
+            for vector, variation in ((slip, slip_variation), (start, zeros)):
+                variation = variation + _cross(spin, vector)
+                parts.append(np.einsum("qij,qjm->qim", present.rotation, variation))
         else:
             parts += [np.zeros((n, d, m))] * 2
-        change = by_felt @ np.concatenate(parts, axis=1)
+        traction_variation = by_local_jump @ np.concatenate(parts, axis=1)
         blocks = np.zeros((n, m, m))
-        blocks[:, own] += change
-        blocks[:, other] -= change
-        blocks[:, other_slopes] -= np.einsum("qi,qam->qaim", traction, slide).reshape(
+        blocks[:, slave_rows] += traction_variation
+        blocks[:, master_rows] -= traction_variation
+        blocks[:, master_slopes] -= np.einsum("qi,qam->qaim", traction, slide).reshape(
             n, d * (d - 1), m
         )
-        blocks[now.hits.facet < 0] = 0.0
+        blocks[present.hits.facet < 0] = 0.0
         return blocks
 
-    def _spin(self, normal: Array, slopes: slice) -> Array:
-        """Rᵀ δR as axial vectors, in the plane as angles: (n_points, 3 or 1, 2 d²).
+    def _rotation_variation(self, normal: Array, slave_slopes: slice) -> Array:
+        """Return Rᵀ δR as axial vectors, in the plane as angles, (n_points, 3 or 1, 2 d²).
 
         In space X U + U X = W - Wᵀ with W = Rᵀ δF and the stretch U; the axial vector of its left
         side is (tr U - U) x.
         """
         assert self._present is not None and self._committed is not None
-        now, before, d = self._present, self._committed, self._gdim
+        present, committed, d = self._present, self._committed, self._gdim
         if d == 2:
-            angle = now.normal[:, :1] * normal[:, 1] - now.normal[:, 1:] * normal[:, 0]
+            angle = present.normal[:, :1] * normal[:, 1] - present.normal[:, 1:] * normal[:, 0]
             return np.asarray(angle[:, None])
         n = len(normal)
-        gradient = np.einsum("qim,qj->qijm", normal, before.normal)
+        gradient = np.einsum("qim,qj->qijm", normal, committed.normal)
         unit = np.eye(d)
-        own = np.einsum("ik,qja->qijak", unit, before.along).reshape(n, d, d, 2 * d)
-        gradient[..., slopes] += own
-        w = np.einsum("qji,qjkm->qikm", now.rotation, gradient)
+        by_slopes = np.einsum("ik,qja->qijak", unit, committed.along).reshape(n, d, d, 2 * d)
+        gradient[..., slave_slopes] += by_slopes
+        w = np.einsum("qji,qjkm->qikm", present.rotation, gradient)
         skew = w - np.swapaxes(w, 1, 2)
         axial = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
-        trace = np.trace(now.stretch, axis1=1, axis2=2)
-        return np.linalg.solve(trace[:, None, None] * unit - now.stretch, axial)
+        trace = np.trace(present.stretch, axis1=1, axis2=2)
+        return np.linalg.solve(trace[:, None, None] * unit - present.stretch, axial)
 
 
 @dataclass(frozen=True)
 class FiniteSlidingKinematics:
-    """Numbers of `FiniteSlidingPairs` stand for all that bodies do.
+    """`LocalKinematics` of finite sliding, functions of `FiniteSlidingPairs.local_jump`.
 
     Attributes:
-        multipliers: λ_n and λ_t, which take the place of committed tractions.
+        multipliers: λ_n and λ_t, which replace the committed tractions.
     """
 
     multipliers: PointFields | None
 
     def __call__(self, jump: Any, law: Law, geometry: PointGeometry) -> PointKinematics:
-        """What a law sees of `FiniteSlidingPairs.local_jump` (UFL)."""
+        """Return the local kinematics at the values of `FiniteSlidingPairs.local_jump` (UFL)."""
         d = len(geometry.normal)
         normal, slip, start = (
             ufl.as_vector([jump[1 + part * d + i] for i in range(d)]) for part in range(3)
@@ -366,39 +377,39 @@ class FiniteSlidingKinematics:
         return PointKinematics(jump[0], normal, increment, increment, traction, multiplier)
 
 
-def _metric(vectors: Array) -> tuple[Array, Mask]:
-    """That of unit vectors along vectors (n, d, m), and where these span a space: (n,)."""
+def _unit_gram(vectors: Array) -> tuple[Array, Mask]:
+    """Return the Gram matrix of vectors (n, d, m) made unit, and whether they are independent."""
     with np.errstate(all="ignore"):
         unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-        metric = np.einsum("qia,qib->qab", unit, unit)
-        return metric, np.atleast_1d(np.linalg.det(metric) > ROUND_OFF)
+        gram = np.einsum("qia,qib->qab", unit, unit)
+        return gram, np.atleast_1d(np.linalg.det(gram) > ROUND_OFF)
 
 
 def _reciprocal(tangents: Array) -> tuple[Array, Mask]:
-    """Vectors a^α with a^α·a_β = δ_αβ, in the tangent plane: (n, d, d - 1); or 0 of no plane.
+    """Return dual vectors a^α with a^α·a_β = δ_αβ, (n, d, d - 1), and where a plane is spanned.
 
-    And where there is a tangent plane, (n,).
+    They are zero where the tangents span no plane.
     """
-    metric, spans = _metric(tangents)
-    metric[~spans] = np.eye(metric.shape[1])
+    gram, is_plane = _unit_gram(tangents)
+    gram[~is_plane] = np.eye(gram.shape[1])
     size = np.linalg.norm(tangents, axis=1, keepdims=True)
     unit = np.zeros_like(tangents)
-    np.divide(tangents, size, out=unit, where=spans[:, None, None])
-    found = np.swapaxes(np.linalg.solve(metric, np.swapaxes(unit, 1, 2)), 1, 2)
-    return np.divide(found, size, out=np.zeros_like(found), where=spans[:, None, None]), spans
+    np.divide(tangents, size, out=unit, where=is_plane[:, None, None])
+    dual = np.swapaxes(np.linalg.solve(gram, np.swapaxes(unit, 1, 2)), 1, 2)
+    return np.divide(dual, size, out=np.zeros_like(dual), where=is_plane[:, None, None]), is_plane
 
 
-def _polar(gradient: Array) -> Array:
-    """The rotations in gradients, (n, d, d); none in what is not finite."""
+def _polar_rotation(gradient: Array) -> Array:
+    """Return the rotations of deformation gradients, (n, d, d); the identity if not finite."""
     finite = np.atleast_1d(np.isfinite(gradient).all(axis=(1, 2)))
     gradient = np.where(finite[:, None, None], gradient, np.eye(gradient.shape[1]))
     left, _, right = np.linalg.svd(gradient)
     return np.asarray(left @ right)
 
 
-def _crossed(turns: Array, vectors: Array) -> Array:
-    """Small turns times vectors (n, d): (n, d, m)."""
-    if turns.shape[1] == 1:
-        across = np.column_stack([-vectors[:, 1], vectors[:, 0]])
-        return across[:, :, None] * turns
-    return np.asarray(np.cross(turns, vectors[:, :, None], axis=1), dtype=np.float64)
+def _cross(rotations: Array, vectors: Array) -> Array:
+    """Return infinitesimal rotations (axial vectors) times vectors (n, d): (n, d, m)."""
+    if rotations.shape[1] == 1:
+        perpendicular = np.column_stack([-vectors[:, 1], vectors[:, 0]])
+        return perpendicular[:, :, None] * rotations
+    return np.asarray(np.cross(rotations, vectors[:, :, None], axis=1), dtype=np.float64)
