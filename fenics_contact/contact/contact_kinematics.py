@@ -252,7 +252,7 @@ class ContactKinematics(ABC):
         law, quadrature, jump = self._parts.law, self._parts.quadrature, self.local_jump
         # With finite kinematics derivatives by the motion follow from those by the jump.
         free_shift = {} if self.is_finite else self._parts.inputs.free_shift
-        arguments: dict[str, Any] = {"given": self.given, "free": free_shift}
+        arguments: dict[str, Any] = {"surface_geometry": self.given, "free_shift": free_shift}
         paired = self.pairs.indicator
         mask = active if paired is None else paired * active
         return (

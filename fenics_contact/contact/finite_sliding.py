@@ -122,8 +122,8 @@ class FiniteSlidingPairs(Pairs):
             assert self.search is not None
             place = self.search.located(x)
             self._reference = place, normal
-            hits, penetration_bound = self.search.at_rest(place, x, normal)
-            self._undeformed = np.nan_to_num(hits.distance), penetration_bound
+            hits, depth = self.search.at_rest(place, x, normal)
+            self._undeformed = np.nan_to_num(hits.distance), depth
         changed = self._last_u is None or not np.array_equal(self._last_u, self._u.x.array)
         if self._mesh.comm.allreduce(int(changed)) or self._present is None:
             self._last_u = self._u.x.array.copy()
@@ -134,28 +134,21 @@ class FiniteSlidingPairs(Pairs):
         """Find the opposite points at the present displacement. Collective."""
         assert self._reference is not None and self._undeformed is not None
         assert self.search is not None and self.indicator is not None
-        slave, facet = self._rays.here.facets, self._rays.facet
-        place, undeformed = self._reference
+        side, facet, (place, undeformed) = self._rays.here.facets, self._rays.facet, self._reference
         if self._committed is None:
-            x, tangents = slave.positions(facet, place, self._committed_u)
-            normal = slave.outward_normals(facet, tangents)
+            x, tangents = side.positions(facet, place, self._committed_u)
+            normal = side.outward_normals(facet, tangents)
             self._committed = _Committed(x, normal, _reciprocal(tangents)[0])
         committed = self._committed
-        _, tangents = slave.positions(facet, place, self._u)
+        _, tangents = side.positions(facet, place, self._u)
         along, is_plane = _reciprocal(tangents)
         self.degenerate = bool(self._mesh.comm.allreduce(int(not is_plane.all())))
-        normal = slave.outward_normals(facet, tangents)
-        penetration_bound = self.search.largest(history.values("penetration"))
+        normal = side.outward_normals(facet, tangents)
+        depth = self.search.largest(history.values("penetration"))
         if not global_max(self._mesh.comm, np.abs(self._committed_u.x.array)) > 0:
-            penetration_bound = np.maximum(penetration_bound, self._undeformed[1])
+            depth = np.maximum(depth, self._undeformed[1])
         hits = self._rays.follow(
-            facet,
-            place,
-            normal,
-            self._u,
-            penetration_bound,
-            undeformed=undeformed,
-            before=self._committed_u,
+            facet, place, normal, self._u, depth, undeformed=undeformed, before=self._committed_u
         )
         paired = hits.facet >= 0
         # Of bodies in contact without pressure, round-off would close half of the points.
@@ -270,11 +263,11 @@ class FiniteSlidingPairs(Pairs):
         bs = space.dofmap.bs
         values = np.repeat(values[:, :, None], d, axis=2)
         columns = all_nodes[:, :, None] * bs + np.arange(d)[None, None, :, None]
-        is_nonzero = np.abs(values) > ROUND_OFF
-        pointers = np.concatenate([[0], np.cumsum(is_nonzero.sum(axis=3).ravel())])
+        nonzero = np.abs(values) > ROUND_OFF
+        pointers = np.concatenate([[0], np.cumsum(nonzero.sum(axis=3).ravel())])
         n_columns = space.dofmap.index_map.size_local * bs
         return sparse_matrix(
-            space.mesh.comm, n_columns, pointers, columns[is_nonzero], values[is_nonzero]
+            space.mesh.comm, n_columns, pointers, columns[nonzero], values[nonzero]
         )
 
     def tangent(self, by_local_jump: Array, traction: Array, history: PointFields) -> Array:

@@ -1,4 +1,4 @@
-"""Distance and normal of a rigid obstacle at any place, in numbers."""
+"""Distance and normal of a rigid obstacle at any position."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from fenics_contact.types import Array
 
 __all__ = ["ObstacleSampler"]
 
-# Step of the differences by the distance: sideways to an edge the slope is half of it.
-_STEP = 0.05
-# Least step by the coordinates: their round-off is 1e-5 of it.
-_LEAST_STEP = 1e-11
+# Step of difference quotients, relative to the distance; at edges the slope is half of it.
+_STEP_RATIO = 0.05
+# Smallest step relative to the coordinates, whose round-off is 1e-5 of it.
+_MIN_STEP_RATIO = 1e-11
 
 
 class ObstacleSampler:
-    """Evaluates a rigid obstacle at places in its own frame; compiled at the first evaluation.
+    """Evaluates a rigid obstacle at positions in its own frame; compiled at the first evaluation.
 
-    The obstacle's shape depends on the constants in its distance, which may change from one
-    increment to the next; between the committed shape and the present one they go straight on.
+    The shape of the obstacle depends on the constants in its distance, which may change between
+    increments; between committed and present shape they are interpolated linearly.
 
     Args:
         quadrature: The points of Γc, whose function space the compiled form uses.
-        obstacle: Gap and direction at a place in the obstacle's frame (UFL), or the obstacle
-            itself where it is known in numbers.
+        obstacle: Gap and direction at a position in the obstacle's frame (UFL), or a
+            `SampledObstacle`.
     """
 
     def __init__(
@@ -43,128 +43,129 @@ class ObstacleSampler:
         self._quadrature, self._obstacle = quadrature, obstacle
         self._comm = quadrature.surface.mesh.comm
         self._constants: list[Any] = []
-        self._committed: list[Any] = []
-        self._evaluate: PointEvaluator | None = None
+        self._committed_constants: list[Any] = []
+        self._evaluator: PointEvaluator | None = None
         if isinstance(obstacle, SampledObstacle):
             return
         mesh = quadrature.surface.mesh
-        self._place = fem.Function(quadrature.space(mesh.geometry.dim), name="place")
+        self._position = fem.Function(quadrature.space(mesh.geometry.dim), name="place")
         self._time = fem.Function(quadrature.space(1), name="time")
-        here = ufl.variable(self._place)
-        placement = obstacle(here)
-        parts = {"gap": placement.gap, "normal": placement.normal}
-        parts["gradient"] = ufl.diff(placement.gap, here)
-        constants = {c for part in parts.values() for c in extract_constants(part)}
+        position = ufl.variable(self._position)
+        placement = obstacle(position)
+        fields = {"gap": placement.gap, "normal": placement.normal}
+        fields["gradient"] = ufl.diff(placement.gap, position)
+        constants = {c for part in fields.values() for c in extract_constants(part)}
         self._constants = sorted(constants, key=lambda c: c.count())
-        self._committed = [fem.Constant(mesh, c.value.copy()) for c in self._constants]
-        pairs = zip(self._constants, self._committed, strict=True)
+        self._committed_constants = [fem.Constant(mesh, c.value.copy()) for c in self._constants]
+        pairs = zip(self._constants, self._committed_constants, strict=True)
         time = self._time[0]
-        between = {c: (1 - time) * then + time * c for c, then in pairs}
-        self._expressions = {name: ufl.replace(part, between) for name, part in parts.items()}
+        interpolated = {c: (1 - time) * committed + time * c for c, committed in pairs}
+        self._expressions = {name: ufl.replace(part, interpolated) for name, part in fields.items()}
 
     @property
     def shape(self) -> Array:
-        """The numbers that the obstacle's shape depends on, as they are now, (n,)."""
+        """The present values of the constants in the obstacle's distance, (n,)."""
         return _values(self._constants)
 
     @property
     def committed_shape(self) -> Array:
-        """The numbers that the obstacle's shape depended on at the last commit, (n,)."""
-        return _values(self._committed)
+        """The values of these constants at the last commit, (n,)."""
+        return _values(self._committed_constants)
 
     @committed_shape.setter
     def committed_shape(self, shape: Array) -> None:
         first = 0
-        for constant in self._committed:
+        for constant in self._committed_constants:
             last = first + constant.value.size
             constant.value[...] = shape[first:last].reshape(constant.value.shape)
             first = last
 
-    def sample(self, place: Array, time: Array | float = 1.0) -> tuple[Array, Array]:
-        """Signed distances, and unit normals from body to obstacle. Collective.
+    def sample(self, position: Array, time: Array | float = 1.0) -> tuple[Array, Array]:
+        """Return signed distances, and unit normals from the body to the obstacle. Collective.
 
         Args:
-            place: In the obstacle's frame, (n, gdim) (length); n may differ from rank to rank.
-            time: From 0, the committed shape, to 1, the present one: (n,) or one for all.
+            position: Positions in the obstacle's frame, (n, gdim) (length); n may differ between
+                ranks.
+            time: From 0, the committed shape, to 1, the present one, one value or (n,).
 
         Returns:
             (n,) (length) and (n, gdim).
         """
         if isinstance(self._obstacle, SampledObstacle):
             with collective_errors(self._comm):
-                found = self._obstacle.sample_checked(place)
-            return found.distance, found.normal
-        distance, normal, _ = self._sample(place, time)
+                sample = self._obstacle.sample_checked(position)
+            return sample.distance, sample.normal
+        distance, normal, _ = self._sample(position, time)
         return distance, normal
 
-    def gradient_error(self, place: Array) -> Array:
-        """Difference of the gradient of the distance and minus the normal, (n,). Collective.
+    def gradient_error(self, position: Array) -> Array:
+        """Return the gradient of the distance plus the normal, its norm, (n,). Collective.
 
         Args:
-            place: In the obstacle's frame, (n, gdim) (length).
+            position: Positions in the obstacle's frame, (n, gdim) (length).
         """
         if isinstance(self._obstacle, SampledObstacle):
             with collective_errors(self._comm):
-                found = self._obstacle.sample_checked(place)
-                gradient, normal = _gradient(self._obstacle, place, found), found.normal
+                sample = self._obstacle.sample_checked(position)
+                gradient, normal = _gradient(self._obstacle, position, sample), sample.normal
         else:
-            _, normal, gradient = self._sample(place, 1.0)
+            _, normal, gradient = self._sample(position, 1.0)
         return np.asarray(np.linalg.norm(gradient + normal, axis=1))
 
-    def _sample(self, place: Array, time: Array | float) -> tuple[Array, Array, Array]:
-        """See `sample`, of an obstacle given by UFL; the gradient of the distance, too."""
-        n, d = place.shape
-        if self._evaluate is None:
-            self._evaluate = PointEvaluator(self._quadrature, self._expressions)
+    def _sample(self, position: Array, time: Array | float) -> tuple[Array, Array, Array]:
+        """Return distance, normal and gradient of an obstacle in UFL, as `sample` does. Collective."""
+        n, d = position.shape
+        if self._evaluator is None:
+            self._evaluator = PointEvaluator(self._quadrature, self._expressions)
         time = np.broadcast_to(time, n)
-        # The form has as many slots as Γc has points: the places go through it in batches.
-        size = max(self._quadrature.n_points, 1)
-        batches = max(self._comm.allgather(-(-n // size) if self._quadrature.n_points else 0))
+        # The form evaluates as many positions at a time as Γc has points.
+        batch_size = max(self._quadrature.n_points, 1)
+        batches = max(self._comm.allgather(-(-n // batch_size) if self._quadrature.n_points else 0))
         distance, normal, gradient = np.zeros(n), np.zeros((n, d)), np.zeros((n, d))
         for k in range(batches):
-            some = slice(k * size, (k + 1) * size)
-            for field, rows in ((self._place, place[some]), (self._time, time[some])):
+            batch = slice(k * batch_size, (k + 1) * batch_size)
+            for field, rows in ((self._position, position[batch]), (self._time, time[batch])):
                 field.x.array[: rows.size] = rows.ravel()
                 field.x.scatter_forward()
-            values, m = self._evaluate(), len(place[some])
-            distance[some], normal[some] = values["gap"][:m], values["normal"][:m]
-            gradient[some] = values["gradient"][:m]
+            values, m = self._evaluator(), len(position[batch])
+            distance[batch], normal[batch] = values["gap"][:m], values["normal"][:m]
+            gradient[batch] = values["gradient"][:m]
         return distance, normal, gradient
 
 
 def _values(constants: Sequence[fem.Constant]) -> Array:
-    """The values of constants one after the other, (n,)."""
+    """Return the concatenated values of constants, (n,)."""
     return np.concatenate([np.zeros(0), *(np.ravel(c.value) for c in constants)])
 
 
 def _gradient(obstacle: SampledObstacle, x: Array, sample: Sample) -> Array:
-    """Gradient of a distance known in numbers, by differences, (n, gdim). Not collective.
+    """Return the gradient of a sampled distance by difference quotients, (n, gdim).
 
     Towards the closest point of the surface the slope of a distance is -1, and sideways it is 0 on
-    one side at least, whatever edges the surface has. It is minus the normal where the step would
-    be below the round-off of the coordinates.
+    one side at least, at edges too. The gradient is minus the normal where the step would be below
+    the round-off of the coordinates.
 
     Args:
-        obstacle: That has the distance.
-        x: Where, (n, gdim) (length).
-        sample: What it returned there.
+        obstacle: The obstacle.
+        x: Positions, (n, gdim) (length).
+        sample: The sample of the obstacle there.
     """
     length = np.linalg.norm(sample.normal, axis=1, keepdims=True)
     unit = sample.normal / np.where(length > 0, length, np.nan)
-    gradient, step = -unit, _STEP * np.abs(sample.distance)
-    resolved = step > _LEAST_STEP * np.abs(x).max(axis=1, initial=0.0)
+    gradient, step = -unit, _STEP_RATIO * np.abs(sample.distance)
+    resolved = step > _MIN_STEP_RATIO * np.abs(x).max(axis=1, initial=0.0)
     resolved &= np.isfinite(unit[:, 0])
     x, unit, step = x[resolved], unit[resolved], step[resolved]
     distance = sample.distance[resolved]
     axes = np.linalg.svd(unit[:, None, :])[2]  # the rows after the first are tangents
     axes[:, 0] = np.copysign(1.0, distance)[:, None] * unit
-    found = np.zeros_like(unit)
+    components = np.zeros_like(unit)
     for k in range(x.shape[1]):
         slope: Array = np.full(len(x), np.inf)
         for signed in (step, -step) if k else (step,):
-            moved = obstacle.sample_checked(x + signed[:, None] * axes[:, k]).distance
-            one_sided = (moved - distance) / signed
-            slope = np.where(np.abs(one_sided) < np.abs(slope), one_sided, slope)
-        found += slope[:, None] * axes[:, k]
-    gradient[resolved] = found
+            displaced = obstacle.sample_checked(x + signed[:, None] * axes[:, k]).distance
+            quotient = (displaced - distance) / signed
+            slope = np.where(np.abs(quotient) < np.abs(slope), quotient, slope)
+        components += slope[:, None] * axes[:, k]
+    gradient[resolved] = components
     return gradient

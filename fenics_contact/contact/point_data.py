@@ -1,8 +1,7 @@
-"""What was given of a contact, sampled at its points.
+"""User data of a contact, sampled at the quadrature points.
 
-A law sees numbers at the points and not the expressions they come from, so that what is compiled
-for a law serves every obstacle, gap and body. The numbers follow the constants and functions in the
-expressions.
+A law is evaluated with values at the points, so that the compiled law serves every obstacle, gap
+and body. The values follow the constants and functions in the expressions.
 """
 
 from __future__ import annotations
@@ -28,13 +27,13 @@ class PointData:
 
     Args:
         expressions: Scalars and vectors by name.
-        geometry: Names of those that laws see.
+        geometry: Names of the expressions that laws use.
 
     Attributes:
-        values: All of them, (n_points,) or (n_points, d), as sampled by the last `update`.
+        values: All values, (n_points,) or (n_points, d), as sampled by the last `update`.
 
     Raises:
-        ValueError: One of them cannot be compiled; it says which. On all ranks.
+        ValueError: An expression cannot be compiled; raised on all ranks.
     """
 
     def __init__(
@@ -49,10 +48,10 @@ class PointData:
             self._evaluate = PointEvaluator(quadrature, expressions)
         except Exception as error:
             raise_collectively(self._comm, error)
-            refused = _refused(quadrature, expressions)
-            if refused is None:
+            failure = _find_uncompilable(quadrature, expressions)
+            if failure is None:
                 raise
-            raise ValueError(f"{name}: {refused}") from error
+            raise ValueError(f"{name}: {failure}") from error
         form = self._evaluate.form
         self._dependence = Dependence(form.constants(), form.coefficients())
         shapes = {name: ufl.as_ufl(expressions[name]).ufl_shape for name in geometry}
@@ -61,11 +60,11 @@ class PointData:
         self.values: Mapping[str, Array] = {}
 
     def ufl(self, name: str) -> ufl.core.expr.Expr:
-        """One of those that laws see, as a function at the points (UFL)."""
+        """Return an expression of the laws as a function at the points (UFL)."""
         return self._fields.ufl(name)
 
     def reads(self, constant: fem.Constant) -> bool:
-        """Whether a constant is in any of the expressions."""
+        """Whether an expression depends on a constant."""
         return self._dependence.has(constant)
 
     def update(self) -> None:
@@ -74,13 +73,13 @@ class PointData:
         if self._comm.size > 1:
             changed = self._comm.allreduce(int(changed)) > 0
         if changed:
-            self._dependence.forget()  # until all is sampled
+            self._dependence.forget()  # in case of an error below
             self.values = self._evaluate()
             self._fields.assign(self.values)
             self._dependence.note()
 
 
-def _refused(
+def _find_uncompilable(
     quadrature: SurfaceQuadrature, expressions: Mapping[str, ufl.core.expr.Expr]
 ) -> str | None:
     """The first expression that does not compile, and why; None: nothing does. Collective."""
@@ -93,9 +92,9 @@ def _refused(
             if not name:
                 return None
             what = {"initial_gap": "gap"}.get(name, name.removeprefix("parameter "))
-            why = comm.bcast(str(error))
+            reason = comm.bcast(str(error))
             return (
-                f"{what} cannot be compiled for the points of Γc ({why}); give a number, a "
+                f"{what} cannot be compiled for the points of Γc ({reason}); give a number, a "
                 "fem.Constant, or a fem.Function that has its values"
             )
     return None

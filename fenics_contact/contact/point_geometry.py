@@ -1,7 +1,6 @@
-"""What points of Γc feel of displacements: kinematics of small displacements.
+"""Small-displacement kinematics at the points of Γc, eq. (1): normal and gap are undeformed.
 
-Gap and normals are those of the undeformed body. The map from displacements to what a point feels
-relative to its obstacle is constant (`ContactOperator`), and a linear bulk stays linear.
+The map from dofs to the jump at the points is constant, so that a linear bulk remains linear.
 """
 
 from __future__ import annotations
@@ -20,13 +19,13 @@ __all__ = ["LocalKinematics", "PointGeometry", "SmallKinematics", "tangential"]
 
 @dataclass(frozen=True)
 class PointGeometry:
-    """What a law sees of a point apart from displacements (UFL).
+    """Geometry and parameters of a law at the points, independent of displacements (UFL).
 
     Attributes:
-        gap: Initial gap, the motion of the obstacle included (length).
-        normal: Unit normal from body to obstacle.
-        shift: Displacement of the obstacle; None: it has none.
-        parameters: Of the law, by name.
+        gap: Initial gap, including the motion of the obstacle (length).
+        normal: Unit normal from the body to the obstacle.
+        shift: Displacement of the obstacle; None if it has none.
+        parameters: Parameters of the law, by name.
     """
 
     gap: Any
@@ -35,28 +34,28 @@ class PointGeometry:
     parameters: Mapping[str, Any]
 
     def relative(self, jump: Any) -> Any:
-        """Displacement of the body relative to the obstacle (UFL)."""
+        """Return the displacement of the body relative to the obstacle (UFL)."""
         return jump if self.shift is None else jump - self.shift
 
 
-# What a law sees of a displacement of the body relative to what lies opposite (all UFL).
+# Local kinematics of a law at a jump (UFL).
 LocalKinematics: TypeAlias = Callable[[Any, Law, PointGeometry], PointKinematics]
 
 
 @dataclass(frozen=True)
 class SmallKinematics:
-    """Displacements that change neither the normals nor the place of the obstacle.
+    """`LocalKinematics` of small displacements, with the undeformed normals and gap.
 
     Attributes:
         history: The committed state.
-        multipliers: λ_n and λ_t, which take the place of committed tractions.
+        multipliers: λ_n and λ_t, which replace the committed tractions.
     """
 
     history: PointFields
     multipliers: PointFields | None
 
     def __call__(self, jump: Any, law: Law, geometry: PointGeometry) -> PointKinematics:
-        """What a law sees of a displacement of the body, relative to what lies opposite (UFL)."""
+        """Return the local kinematics at a jump (UFL)."""
         normal = geometry.normal
         total = increment = traction = multiplier = None
         if self.multipliers is not None:
@@ -64,8 +63,7 @@ class SmallKinematics:
         if law.has_tangential:
             total = tangential(geometry.relative(jump), normal)
         if law.has_friction:
-            # The old traction and displacement are taken along the present normal: the obstacle
-            # may have moved on since the last commit.
+            # Old traction and jump are projected with the present normal, as obstacles may move.
             increment = tangential(geometry.relative(jump) - self.history.ufl("jump"), normal)
             traction = tangential((self.multipliers or self.history).ufl("traction"), normal)
         gap = geometry.gap - ufl.dot(jump, normal)
@@ -73,5 +71,5 @@ class SmallKinematics:
 
 
 def tangential(vector: Any, normal: Any) -> Any:
-    """The part of a vector across a unit normal (UFL)."""
+    """Return the part of a vector across a unit normal (UFL)."""
     return vector - ufl.dot(vector, normal) * normal

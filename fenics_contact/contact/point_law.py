@@ -1,4 +1,4 @@
-"""A law at the points of Γc: what it makes of the jump there, compiled when first asked for."""
+"""A contact law at the points of Γc: tractions and tangent, compiled at the first evaluation."""
 
 from __future__ import annotations
 
@@ -24,9 +24,8 @@ from fenics_contact.types import Array
 
 __all__ = ["PointLaw", "PointTangent"]
 
-
-# The size of the mesh times this is a penetration that is next to none.
-_BARELY = 1e-8
+# Negligible penetration, relative to the size of the mesh.
+_CLOSURE_RATIO = 1e-8
 
 
 @dataclass(frozen=True)
@@ -34,12 +33,13 @@ class PointTangent:
     """Derivatives of the traction at the points.
 
     Attributes:
-        by_jump: By the displacement of the body, (n_points, gdim, gdim) (stress/length); where
-            `Pairs.local_map` is one, of the forces on the local unknowns by these.
-        by_shift: By that of the obstacle, likewise; None where no component of it is free.
-        spun: By a turn of body and obstacle together, ω × the traction, (n_points, gdim) (stress);
-            None where the obstacle is not turned by a moment. Anisotropic friction, whose direction
-            stays as it is, has some more.
+        by_jump: By the jump, (n_points, gdim, gdim) (stress/length); of the point forces by the
+            local unknowns if `Pairs.local_map` is not None.
+        by_shift: By the displacement of the obstacle, of the same shape; None if no component is
+            free.
+        spun: By a common rotation of body and obstacle, ω × the traction, (n_points, gdim)
+            (stress); None if no moment rotates the obstacle. It neglects the fixed direction of
+            anisotropic friction.
     """
 
     by_jump: Array
@@ -47,28 +47,28 @@ class PointTangent:
     spun: Array | None = None
 
     def scaled(self, factor: Array) -> PointTangent:
-        """The derivatives times a factor at each point, (n_points,)."""
+        """Return the derivatives times a factor at each point, (n_points,)."""
 
         def times(values: Array) -> Array:
             return values * factor.reshape(-1, *[1] * (values.ndim - 1))
 
-        rest = (None if part is None else times(part) for part in (self.by_shift, self.spun))
-        return PointTangent(times(self.by_jump), *rest)
+        others = (None if part is None else times(part) for part in (self.by_shift, self.spun))
+        return PointTangent(times(self.by_jump), *others)
 
 
 class PointLaw:
-    """What a law makes of displacements at the points, compiled when first asked for.
+    """A contact law as a function of the jump at the points, compiled at the first evaluation.
 
     Args:
-        kinematics: What the law sees of displacements.
-        jump: Displacement of the body at the points, of that opposite taken away.
-        acts: 1 at points at which it acts, 0 at others (UFL); None: it acts at all.
-        given: ``geometry`` as expressions on Γc, which the derivatives by ``free`` are of.
-        free: Unknown components of the obstacle's displacement in these, `Inputs.free_shift`.
+        kinematics: Local kinematics at a jump.
+        jump: Displacement of the body at the points, minus that of an opposing body.
+        mask: 1 at points at which the law acts, 0 at others (UFL); None for 1.
+        surface_geometry: ``geometry`` as expressions on Γc, for the derivatives by ``free_shift``.
+        free_shift: Unknown components of the obstacle's displacement, `Inputs.free_shift`.
 
     Attributes:
         law: The law.
-        geometry: What it sees of the points apart from displacements.
+        geometry: Geometry and parameters of the law at the points.
     """
 
     def __init__(
@@ -80,16 +80,16 @@ class PointLaw:
         jump: fem.Function,
         *,
         mask: Any,
-        given: PointGeometry,
-        free: Mapping[int, Any],
+        surface_geometry: PointGeometry,
+        free_shift: Mapping[int, Any],
     ) -> None:
         self.law, self.geometry = law, geometry
         self._kinematics, self._quadrature, self._jump = kinematics, quadrature, jump
-        self._mask, self._given, self._free = mask, given, free
+        self._mask, self._surface_geometry, self._free_shift = mask, surface_geometry, free_shift
         self._gdim = quadrature.surface.mesh.geometry.dim
 
     def with_law(self, law: Law, parameters: Mapping[str, Any]) -> PointLaw:
-        """Another law at the same points, with parameters of its own."""
+        """Return another law at the same points, with its own parameters."""
         return PointLaw(
             law,
             replace(self.geometry, parameters=parameters),
@@ -97,14 +97,14 @@ class PointLaw:
             self._quadrature,
             self._jump,
             mask=self._mask,
-            given=self._given,
-            free=self._free,
+            surface_geometry=self._surface_geometry,
+            free_shift=self._free_shift,
         )
 
     # ---- as UFL ----------------------------------------------------------------------------------
 
-    def _there(self, value: Any) -> Any:
-        """A value at points at which the law acts, 0 at the others; None stays None."""
+    def _restrict(self, value: Any) -> Any:
+        """Return a value times the mask; None stays None."""
         return value if self._mask is None or value is None else self._mask * value
 
     def _point_kinematics(
@@ -113,33 +113,33 @@ class PointLaw:
         jump = self._jump if jump is None else jump
         return self._kinematics(jump, self.law, geometry or self.geometry)
 
-    def _response(
-        self, felt: PointKinematics, geometry: PointGeometry | None = None
+    def _contact_traction(
+        self, local: PointKinematics, geometry: PointGeometry | None = None
     ) -> ContactTraction:
-        """What the law answers, nothing at points at which it does not act."""
-        response = self.law.contact_traction(felt, (geometry or self.geometry).parameters)
-        parts = {f.name: getattr(response, f.name) for f in fields(response)}
-        slip = tuple(self._there(mode) for mode in parts.pop("slip"))
-        return replace(response, **{n: self._there(v) for n, v in parts.items()}, slip=slip)
+        """Return the tractions of the law, zero at masked points."""
+        result = self.law.contact_traction(local, (geometry or self.geometry).parameters)
+        parts = {f.name: getattr(result, f.name) for f in fields(result)}
+        slip = tuple(self._restrict(mode) for mode in parts.pop("slip"))
+        return replace(result, **{n: self._restrict(v) for n, v in parts.items()}, slip=slip)
 
     def traction(self, jump: Any, geometry: PointGeometry | None = None) -> Any:
-        """r_n n + τ on the body, at a displacement (UFL)."""
+        """Return r_n n + τ on the body at a jump (UFL)."""
         geometry = geometry or self.geometry
-        felt = self._point_kinematics(jump, geometry)
-        response = self._response(felt, geometry)
-        total = response.normal_traction * felt.normal
-        return total if response.traction is None else total + response.traction
+        local = self._point_kinematics(jump, geometry)
+        result = self._contact_traction(local, geometry)
+        total = result.normal_traction * local.normal
+        return total if result.traction is None else total + result.traction
 
     def potential(self, jump: Any = None) -> Any:
-        """Potential per area, at a displacement (UFL)."""
-        return self._there(
+        """Return the potential per area at a jump (UFL)."""
+        return self._restrict(
             self.law.potential(self._point_kinematics(jump), self.geometry.parameters)
         )
 
     # ---- as numbers ------------------------------------------------------------------------------
 
     def evaluate_traction(self) -> Array:
-        """r_n n + τ, (n_points, gdim) (stress). Collective."""
+        """Evaluate r_n n + τ, (n_points, gdim) (stress). Collective."""
         return self._traction()["traction"]
 
     @cached_property
@@ -147,7 +147,7 @@ class PointLaw:
         return self._evaluator({"traction": self.traction(self._jump)})
 
     def evaluate_potential(self) -> Array:
-        """The potential per area, (n_points,). Collective."""
+        """Evaluate the potential per area, (n_points,). Collective."""
         return self._potential()["potential"]
 
     @cached_property
@@ -155,13 +155,13 @@ class PointLaw:
         return self._evaluator({"potential": self.potential()})
 
     def evaluate_tangent(self) -> PointTangent:
-        """Derivatives of the traction. Collective."""
+        """Evaluate the derivatives of the traction. Collective."""
         rows, d = self._tangent(), range(self._gdim)
         by_jump = np.stack([rows[f"jump {i}"] for i in d], axis=1)
-        if not self._free:
+        if not self._free_shift:
             return PointTangent(by_jump)
-        columns, none = self._by_shift(), np.zeros(by_jump.shape[:2])
-        return PointTangent(by_jump, np.stack([columns.get(str(i), none) for i in d], axis=2))
+        columns, zeros = self._by_shift(), np.zeros(by_jump.shape[:2])
+        return PointTangent(by_jump, np.stack([columns.get(str(i), zeros) for i in d], axis=2))
 
     @cached_property
     def _tangent(self) -> PointEvaluator:
@@ -171,170 +171,169 @@ class PointLaw:
 
     @cached_property
     def _by_shift(self) -> PointEvaluator:
-        """By the free displacement of the obstacle, in its own expressions."""
-        geometry = replace(self._given, parameters=self.geometry.parameters)
+        """Derivatives by the free displacement of the obstacle, with its own expressions."""
+        geometry = replace(self._surface_geometry, parameters=self.geometry.parameters)
         traction = self.traction(self._jump, geometry)
-        columns = {str(i): ufl.diff(traction, shift) for i, shift in self._free.items()}
+        columns = {str(i): ufl.diff(traction, shift) for i, shift in self._free_shift.items()}
         return PointEvaluator(self._quadrature, columns)
 
     def evaluate_yield(self) -> tuple[Array, Array]:
-        """The law's yield functions and their gradients. Collective.
+        """Evaluate the law's yield functions and their gradients. Collective.
 
         Returns:
             g_j(τ, bound) (stress), (n_points, n_modes), and ∂g_j/∂τ, (n_points, n_modes, gdim).
         """
-        found = self._yield()
-        gradients = [found[name] for name in found if name != "functions"]
-        return found["functions"], np.stack(gradients, axis=1)
+        samples = self._yield()
+        gradients = [samples[name] for name in samples if name != "functions"]
+        return samples["functions"], np.stack(gradients, axis=1)
 
     @cached_property
     def _yield(self) -> PointEvaluator:
-        felt = self._point_kinematics()
-        response, parameters = self._response(felt), self.geometry.parameters
-        traction = ufl.variable(response.traction)
-        functions = self.law.yield_functions(felt, traction, response.friction_bound, parameters)
+        local = self._point_kinematics()
+        result, parameters = self._contact_traction(local), self.geometry.parameters
+        traction = ufl.variable(result.traction)
+        functions = self.law.yield_functions(local, traction, result.friction_bound, parameters)
         rows = {f"gradient {j}": ufl.diff(g, traction) for j, g in enumerate(functions)}
         return self._evaluator({"functions": ufl.as_vector(functions)} | rows)
 
     def prepare(self) -> None:
-        """Compile what `evaluate` needs. Collective."""
-        _ = self._all
+        """Compile the expressions of `evaluate`. Collective."""
+        _ = self._all_fields
 
     def evaluate(self) -> dict[str, Array]:
-        """All that a law tells, by name; see `PointValues`. Collective."""
-        found = self._all()
+        """Evaluate all fields of `PointValues` that the law determines, by name. Collective."""
+        samples = self._all_fields()
         if self.law.has_friction:
-            found["friction_bound_ratio"] = self._ratio(found)
+            samples["friction_bound_ratio"] = self._friction_bound_ratio(samples)
         elif self.law.has_tangential:
-            resists = [
-                np.any(found[f"tangential_stiffness {i}"], axis=1) for i in range(self._gdim)
-            ]
-            found["friction_bound_ratio"] = np.where(np.any(resists, axis=0), np.inf, 0.0)
-        return found
+            rows = [np.any(samples[f"tangential_stiffness {i}"], axis=1) for i in range(self._gdim)]
+            samples["friction_bound_ratio"] = np.where(np.any(rows, axis=0), np.inf, 0.0)
+        return samples
 
-    def _ratio(self, found: dict[str, Array]) -> Array:
-        """`PointValues.friction_bound_ratio`; what it was made of is taken out."""
-        found.setdefault("circumradius", np.full(len(found["friction_bound"]), np.inf))
+    def _friction_bound_ratio(self, samples: dict[str, Array]) -> Array:
+        """Return `PointValues.friction_bound_ratio`; the fields for it are removed."""
+        samples.setdefault("circumradius", np.full(len(samples["friction_bound"]), np.inf))
         if not self._bound_is_linear:
-            return np.full(len(found["friction_bound"]), np.inf)
-        slope, cohesion = found.pop("slope of the bound"), found.pop("cohesion")
-        radius = np.where(slope > 0, found["circumradius"], 0.0)
+            return np.full(len(samples["friction_bound"]), np.inf)
+        slope, cohesion = samples.pop("slope of the bound"), samples.pop("cohesion")
+        radius = np.where(slope > 0, samples["circumradius"], 0.0)
         return np.where(cohesion > 0, np.inf, slope * radius)
 
     @property
     def bound_depends_on_motion(self) -> bool:
-        """Whether the friction bound is a function of the motion itself, beside the pressure."""
-        return self._bound[0]
+        """Whether the friction bound depends on the kinematics, besides the pressure."""
+        return self._bound_dependence[0]
 
     @property
     def _bound_is_linear(self) -> bool:
-        """Whether the friction bound is m p + c, with m and c from the data alone."""
-        return self._bound[1]
+        """Whether the friction bound is m p + c, with m and c independent of the kinematics."""
+        return self._bound_dependence[1]
 
     @cached_property
-    def _bound(self) -> tuple[bool, bool]:
-        """What the expression of the friction bound says of itself; see the properties."""
-        felt = self._point_kinematics()
+    def _bound_dependence(self) -> tuple[bool, bool]:
+        """Whether the friction bound depends on the kinematics, and whether it is linear."""
+        local = self._point_kinematics()
         names = ["gap", "tangential_displacement", "tangential_increment", "multiplier"]
-        given = {name: getattr(felt, name) for name in names}
-        motion = {n: ufl.variable(v) for n, v in given.items() if v is not None}
+        given = {name: getattr(local, name) for name in names}
+        variables = {n: ufl.variable(v) for n, v in given.items() if v is not None}
         pressure = ufl.variable(self.geometry.gap)  # any scalar
-        bound = self.law.friction_bound(replace(felt, **motion), pressure, self.geometry.parameters)
-        if any(_depends(bound, variable) for variable in motion.values()):
+        local = replace(local, **variables)
+        bound = self.law.friction_bound(local, pressure, self.geometry.parameters)
+        if any(_depends_on(bound, variable) for variable in variables.values()):
             return True, False
-        return False, not _depends(ufl.diff(bound, pressure), pressure)
+        return False, not _depends_on(ufl.diff(bound, pressure), pressure)
 
     @cached_property
-    def _all(self) -> PointEvaluator:
-        law, parameters, felt = self.law, self.geometry.parameters, self._point_kinematics()
-        response = self._response(felt)
-        told = {
-            "normal_displacement": self.geometry.gap - felt.gap,
-            "opening": self._there(positive_part(felt.gap)),
-            "penetration": self._there(positive_part(-felt.gap)),
-            "normal_traction": response.normal_traction,
-            "stored": self._there(law.stored(felt, response, parameters)),
+    def _all_fields(self) -> PointEvaluator:
+        law, parameters, local = self.law, self.geometry.parameters, self._point_kinematics()
+        result = self._contact_traction(local)
+        expressions = {
+            "normal_displacement": self.geometry.gap - local.gap,
+            "opening": self._restrict(positive_part(local.gap)),
+            "penetration": self._restrict(positive_part(-local.gap)),
+            "normal_traction": result.normal_traction,
+            "stored": self._restrict(law.stored(local, result, parameters)),
         }
         if law.has_own_normal:
-            told |= self._own_normal(felt, response)
+            expressions |= self._own_normal_fields(local, result)
         if law.has_tangential:
-            stiffness = law.tangential_stiffness(felt, parameters)
-            told |= {"traction": response.traction}
-            told |= {f"tangential_stiffness {i}": stiffness[i, :] for i in range(self._gdim)}
+            stiffness = law.tangential_stiffness(local, parameters)
+            expressions |= {"traction": result.traction}
+            expressions |= {f"tangential_stiffness {i}": stiffness[i, :] for i in range(self._gdim)}
         if law.has_friction:
-            pressure = ufl.variable(-response.normal_traction)
-            bound = law.friction_bound(felt, pressure, parameters)
-            told |= {
-                "bound_of_law": self._there(bound),
-                "friction_bound_slope": self._there(ufl.diff(bound, pressure)),
-                "increment": felt.tangential_increment,
-                "old_traction": felt.traction,
-                "friction_bound": response.friction_bound,
-                "dissipated": self._there(law.dissipated(felt, response, parameters)),
-                "slip_increment": ufl.as_vector(response.slip),
+            pressure = ufl.variable(-result.normal_traction)
+            bound = law.friction_bound(local, pressure, parameters)
+            expressions |= {
+                "bound_of_law": self._restrict(bound),
+                "friction_bound_slope": self._restrict(ufl.diff(bound, pressure)),
+                "increment": local.tangential_increment,
+                "old_traction": local.traction,
+                "friction_bound": result.friction_bound,
+                "dissipated": self._restrict(law.dissipated(local, result, parameters)),
+                "slip_increment": ufl.as_vector(result.slip),
             }
             circumradius = law.circumradius(parameters)
             if circumradius is not None:
-                told["circumradius"] = circumradius
+                expressions["circumradius"] = circumradius
             if self._bound_is_linear:
-                told |= {
+                expressions |= {
                     "slope of the bound": ufl.diff(bound, pressure),
-                    "cohesion": law.friction_bound(felt, ufl.as_ufl(0.0), parameters),
+                    "cohesion": law.friction_bound(local, ufl.as_ufl(0.0), parameters),
                 }
-        if felt.multiplier is not None:
-            told |= {"multiplier": felt.multiplier}
+        if local.multiplier is not None:
+            expressions |= {"multiplier": local.multiplier}
             if law.has_friction:
-                assert felt.traction is not None
-                borne = felt.traction - response.traction
-                told["elastic_slip"] = law.elastic_displacement(felt, borne, parameters)
-        return self._evaluator(told)
+                assert local.traction is not None
+                change = local.traction - result.traction
+                expressions["elastic_slip"] = law.elastic_displacement(local, change, parameters)
+        return self._evaluator(expressions)
 
     @cached_property
-    def _barely(self) -> fem.Constant:
-        """A length that is nothing beside the mesh, of laws with a normal of their own. Collective.
-
-        It is measured where it is asked for alone.
-        """
+    def _closure(self) -> fem.Constant:
+        """A penetration that is negligible compared with the mesh size. Collective."""
         surface = self._quadrature.surface
         comm, x = surface.mesh.comm, surface.mesh.geometry.x
-        return fem.Constant(surface.submesh, _BARELY * (global_max(comm, x) - global_min(comm, x)))
+        size = global_max(comm, x) - global_min(comm, x)
+        return fem.Constant(surface.submesh, _CLOSURE_RATIO * size)
 
-    def _own_normal(self, felt: PointKinematics, response: ContactTraction) -> dict[str, Any]:
-        """What is known of r_n that does not follow from k_n (UFL): stiffness, and another way."""
+    def _own_normal_fields(self, local: PointKinematics, result: ContactTraction) -> dict[str, Any]:
+        """Return stiffness and reaction r_n of a law's own normal potential (UFL)."""
         law, parameters = self.law, self.geometry.parameters
-        gap = ufl.variable(felt.gap)
-        at_variable = replace(felt, gap=gap)
-        # Where nothing acts the stiffness is that of a point that has just closed.
-        mask = ufl.ne(response.normal_traction, 0)
-        at_closed = replace(felt, gap=ufl.conditional(mask, felt.gap, -self._barely))
+        gap = ufl.variable(local.gap)
+        at_gap = replace(local, gap=gap)
+        # The stiffness of an open point is that just after closure.
+        mask = ufl.ne(result.normal_traction, 0)
+        closed = replace(local, gap=ufl.conditional(mask, local.gap, -self._closure))
         return {
-            "normal_reaction": ufl.diff(law.normal_potential(at_variable, parameters), gap),
-            "normal_stiffness": law.normal_stiffness(at_closed, parameters),
+            "normal_reaction": ufl.diff(law.normal_potential(at_gap, parameters), gap),
+            "normal_stiffness": law.normal_stiffness(closed, parameters),
         }
 
     def _evaluator(self, expressions: Mapping[str, Any]) -> PointEvaluator:
         for expression in expressions.values():
-            self._check_own(expression)
+            self._check_terminals(expression)
         return PointEvaluator(self._quadrature, expressions, by_points=True)
 
-    def _check_own(self, expression: Any) -> None:
-        """Refuse a law that has functions, constants, or places not from its parameters.
+    def _check_terminals(self, expression: Any) -> None:
+        """Check that a law depends on its kinematics and parameters only.
 
-        Those are checked, and told apart in checkpoints.
+        Other functions and constants are neither checked nor stored in checkpoints.
 
         Raises:
-            ValueError: It says what.
+            ValueError: The law uses another function, constant or coordinate.
         """
         submesh = self._quadrature.surface.submesh
         for item in traverse_unique_terminals(ufl.as_ufl(expression)):
-            there = True
+            is_local = True
             if isinstance(item, fem.Constant):
-                there = item is self._barely
+                is_local = item is self._closure
             elif isinstance(item, fem.Function):
-                there = item.function_space.mesh is submesh or item.function_space.mesh == submesh
+                is_local = (
+                    item.function_space.mesh is submesh or item.function_space.mesh == submesh
+                )
             elif isinstance(item, ufl.classes.GeometricQuantity):
-                there = extract_unique_domain(item) == submesh.ufl_domain()
-            if not there:
+                is_local = extract_unique_domain(item) == submesh.ufl_domain()
+            if not is_local:
                 what = getattr(item, "name", None) or f"a {type(item).__name__}"
                 raise ValueError(
                     f"{type(self.law).__name__} uses {what} in contact_traction or another method; "
@@ -343,7 +342,7 @@ class PointLaw:
                 )
 
 
-def _depends(expression: Any, variable: Any) -> bool:
-    """Whether an expression is a function of a `ufl.variable`, its derivatives evaluated."""
-    plain = apply_derivatives(apply_algebra_lowering(ufl.as_ufl(expression)))
-    return variable.label() in set(traverse_unique_terminals(plain))
+def _depends_on(expression: Any, variable: Any) -> bool:
+    """Whether an expression depends on a `ufl.variable`, after evaluation of derivatives."""
+    lowered = apply_derivatives(apply_algebra_lowering(ufl.as_ufl(expression)))
+    return variable.label() in set(traverse_unique_terminals(lowered))

@@ -1,4 +1,4 @@
-"""The states of a contact: committed, solved and not committed, and evaluated at the present u."""
+"""The states of a contact: the committed state, solved trial states, and the present evaluation."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class ContactState:
     """A committed state of a contact: its history, and the results of the increment before it.
 
     Attributes:
-        history: Committed tractions, slip and slip reference, and multipliers: `PointFields.rows`.
-        opposite: Committed place of the obstacle, and the pairs.
+        history: History variables and multipliers, `PointFields.rows`.
+        kinematics: Committed state of the obstacle, and the pairs.
         points: All fields at this rank's points; None before the first commit.
         commits: Number of commits so far.
     """
@@ -47,10 +47,9 @@ class ContactTrial:
     Attributes:
         points: All fields at this rank's quadrature points.
         history: The fields that become history, by name.
-        reference: The history that the increment started from, with the slip reference of bodies
-            that were positioned: `PointFields.rows`.
-        opposite: Committed place of the obstacle, and the pairs of this state, between which it is
-            measured.
+        reference: History at the start of the increment, with the slip reference after initial
+            positioning, `PointFields.rows`.
+        kinematics: Committed state of the obstacle, and the pairs of this state.
     """
 
     points: PointValues
@@ -60,28 +59,28 @@ class ContactTrial:
 
 
 class ContactStates:
-    """The committed state of a contact, and what is evaluated from it at the present ``u``.
+    """The committed state of a contact, and the evaluation of the present ``u`` from it.
 
-    It begins at the ``u`` at construction, which is collective.
+    The constructor is collective, and takes the present ``u`` as the initial state.
 
     Attributes:
         committed: The committed state.
-        history: Its history variables, of which an increment may count slip from elsewhere.
+        history: Its history variables; an increment may change the slip reference.
     """
 
     def __init__(
         self,
         parts: ContactParts,
         multipliers: Multipliers | None,
-        opposite: ContactKinematics,
-        acting: EffectiveLaw,
+        kinematics: ContactKinematics,
+        effective_law: EffectiveLaw,
     ) -> None:
         self.history = history = parts.history
         self._name, self._law, self._multipliers = parts.name, parts.law, multipliers
-        self._opposite, self._effective_law = opposite, acting
+        self._kinematics, self._effective_law = kinematics, effective_law
         self._values: PointValues | None = None
-        opposite.reset_reference()
-        self.committed = ContactState(history.rows(), opposite.state())
+        kinematics.reset_reference()
+        self.committed = ContactState(history.rows(), kinematics.state())
         self._start()
 
     @property
@@ -93,17 +92,14 @@ class ContactStates:
         return self._values
 
     def evaluate(self) -> None:
-        """Evaluate gap, tractions and slip at the present ``u``. Collective.
-
-        The history is not changed.
-        """
+        """Evaluate gap, tractions and slip at the present ``u`` into `values`. Collective."""
         self._values = self.evaluate_present()
 
     def evaluate_present(self) -> PointValues:
-        """Evaluate them without a change of `values`. Collective."""
-        self._opposite.update()
-        arrays = {**self._opposite.data.values, **self._effective_law.own.evaluate()}
-        return PointValues.of(arrays | self._opposite.outputs(arrays))
+        """Return the evaluation at the present ``u``, without a change of `values`. Collective."""
+        self._kinematics.update()
+        arrays = {**self._kinematics.data.values, **self._effective_law.own.evaluate()}
+        return PointValues.of(arrays | self._kinematics.outputs(arrays))
 
     def forget(self) -> None:
         """Discard the last evaluation: the next access to a result evaluates the present ``u``."""
@@ -112,55 +108,53 @@ class ContactStates:
     def begin(self) -> None:
         """Measure slip from the present ``u`` if nothing has been committed yet. Collective.
 
-        The obstacle is taken in its initial position. The constructor does so with the ``u`` at
-        construction, and `ContactProblem` again before its first increment.
+        The obstacle is then in its initial position.
         """
-        if not self.committed.commits and self._opposite.reset_reference():
+        if not self.committed.commits and self._kinematics.reset_reference():
             self._start()
 
     def _start(self) -> None:
         """Make the present ``u`` the state before the first increment. Collective."""
         if self._law.has_friction:
             start = {name: self.history.values(name) for name in self.history.names}
-            self.history.assign(start | self._opposite.reference_fields())
-        self.set_state(ContactState(self.history.rows(), self._opposite.state()))
+            self.history.assign(start | self._kinematics.reference_fields())
+        self.set_state(ContactState(self.history.rows(), self._kinematics.state()))
 
-    def begin_between(self, opposite: KinematicsState) -> None:
-        """Count an increment from its start between other pairs; `restore` undoes it. Collective.
+    def begin_between(self, kinematics: KinematicsState) -> None:
+        """Start the increment from other pairs; `restore` undoes it. Collective.
 
         Args:
-            opposite: The pairs, with the jump between them in the committed state.
+            kinematics: The pairs, with the committed jump between them.
         """
-        moved = opposite.jump - self._opposite.committed_jump
-        self._opposite.set_state(opposite)
+        jump_change = kinematics.jump - self._kinematics.committed_jump
+        self._kinematics.set_state(kinematics)
         if self._law.has_friction:
-            kept = {name: self.history.values(name) for name in self.history.names}
-            self.history.assign(kept | {"jump": kept["jump"] + moved})
+            history = {name: self.history.values(name) for name in self.history.names}
+            self.history.assign(history | {"jump": history["jump"] + jump_change})
         self.forget()
 
     def set_slip_reference(self, points: Mask) -> None:
-        """Measure slip from the state evaluated last where points were unloaded. Collective.
+        """Measure slip from the state evaluated last at unloaded points. Collective.
 
-        `restore` undoes it.
+        `restore` undoes it. Points that were loaded at the last commit keep their reference.
 
         Args:
-            points: Mask of the points, (n_points,); those that were loaded slip from where they
-                did.
+            points: Mask of the points, (n_points,).
         """
         if not self._law.has_friction:
             return
         points = points & (self.history.values("normal_traction") == 0.0)
-        kept = {name: self.history.values(name) for name in self.history.names}
-        slip_reference = self._opposite.slip_reference(self.values)
-        counted = {n: np.where(points[:, None], v, kept[n]) for n, v in slip_reference.items()}
-        self.history.assign(kept | counted)
+        history = {name: self.history.values(name) for name in self.history.names}
+        slip_reference = self._kinematics.slip_reference(self.values)
+        reference = {n: np.where(points[:, None], v, history[n]) for n, v in slip_reference.items()}
+        self.history.assign(history | reference)
         self.forget()
 
     def trial(self, *, is_loaded: bool = True) -> ContactTrial:
         """Return a copy of the evaluated state, for `commit`.
 
         Args:
-            is_loaded: Whether there is a contact force (`ForceBalance.is_loaded`). Without one all
+            is_loaded: Whether there is a contact force (`ForceBalance.is_loaded`). If not, all
                 normal tractions are smaller than the accepted residual, and zero is committed.
         """
         points = self.values
@@ -176,8 +170,8 @@ class ContactStates:
             }
         if self._multipliers is not None:
             values |= self._multipliers.committed(points)
-        history = self._opposite.to_history(values)
-        return ContactTrial(points, history, self.history.rows(), self._opposite.state())
+        history = self._kinematics.to_history(values)
+        return ContactTrial(points, history, self.history.rows(), self._kinematics.state())
 
     def commit(self, trial: ContactTrial | None = None) -> None:
         """Make a solved state the history of the next increment. Collective.
@@ -188,32 +182,32 @@ class ContactStates:
         if trial is None:
             self.evaluate()
             trial = self.trial()
-        # Results stay those of the solution, whatever its pairs.
-        moved = self._opposite.commit(trial.points)
+        # Results remain those of the solution if pairs are updated.
+        jump_change = self._kinematics.commit(trial.points)
         history = dict(trial.history)
-        if moved is not None and self._law.has_friction:
-            history["jump"] = history["jump"] + moved
+        if jump_change is not None and self._law.has_friction:
+            history["jump"] = history["jump"] + jump_change
         rows, commits = self.history.packed(history), self.committed.commits + 1
-        before, opposite = self.committed.kinematics.pairs.found_at, self._opposite.state()
-        self.set_state(ContactState(rows, opposite, trial.points, commits))
-        replaced = before is None and opposite.pairs.found_at is not None
+        before, kinematics = self.committed.kinematics.pairs.found_at, self._kinematics.state()
+        self.set_state(ContactState(rows, kinematics, trial.points, commits))
+        is_first_update = before is None and kinematics.pairs.found_at is not None
         comm = self.history.function.function_space.mesh.comm
-        if replaced and comm.rank == 0:
+        if is_first_update and comm.rank == 0:
             logger.info(
                 "%s: opposite points are those of the deformed bodies from this increment on",
                 self._name,
             )
 
     def set_state(self, state: ContactState) -> None:
-        """Make a state the committed one, and the present one. Collective."""
+        """Make a state the committed one, and restore it. Collective."""
         self.committed = state
         self.restore()
 
     def restore(self, trial: ContactTrial | None = None) -> None:
         """Restore history, multipliers, pairs and results of the last commit. Collective.
 
-        The results are restored, not evaluated again: at the committed state the law would return
-        stick at points that slipped to it. Before the first commit there are no results.
+        The results are not evaluated again: at the committed state the law would return stick at
+        points that slipped to it. Before the first commit there are no results.
 
         Args:
             trial: A state solved since then, whose results are restored instead.
@@ -221,30 +215,28 @@ class ContactStates:
         self.history.set_rows(self.committed.history if trial is None else trial.reference)
         if self._multipliers is not None:
             self._multipliers.restore(self.history)
-        self._opposite.set_state((trial or self.committed).kinematics)
+        self._kinematics.set_state((trial or self.committed).kinematics)
         self._values = (trial or self.committed).points
 
     def load_restart(self, history: Array, values: Mapping[str, Array], *, anew: bool) -> None:
-        """Make a state of another run the committed one. Collective.
-
-        ``u`` and the loads must be those of that run.
+        """Commit a state of another run, whose ``u`` and loads are set. Collective.
 
         Args:
             history: `PointFields.rows` of that run.
             values: The arrays of its `values`, which become the results.
-            anew: Whether pairs are found again at every commit of that run.
+            anew: Whether that run updates pairs at every commit.
         """
         commits = self.committed.commits + 1
-        self.set_state(ContactState(history, self._opposite.state()))
+        self.set_state(ContactState(history, self._kinematics.state()))
 
-        def present() -> PointValues:
+        def evaluate_now() -> PointValues:
             self.forget()
             return self.values
 
         unknown = np.zeros(len(self.history.rows()))
-        self._opposite.resume(values.get("depth", unknown), present, new_pairs=anew)
+        self._kinematics.resume(values.get("depth", unknown), evaluate_now, new_pairs=anew)
         points = self.values
         shapes = {n: v.shape for n, v in points.arrays.items()}
         if {n: v.shape for n, v in values.items()} == shapes:
             points = PointValues.of(values)
-        self.set_state(ContactState(history, self._opposite.state(), points, commits))
+        self.set_state(ContactState(history, self._kinematics.state(), points, commits))
