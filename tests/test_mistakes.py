@@ -263,7 +263,9 @@ def test_components_in_a_tuple():
     way = fem.Constant(scene.mesh, 0.0)
     obstacle = fc.HalfSpace((0, 0), (0, 1), displacement=(way, 0.0))
     raised_everywhere(
-        lambda: scene.contact(coulomb(), obstacle=obstacle), TypeError, "ufl.as_vector([way, 0.0])"
+        lambda: scene.contact(coulomb(), obstacle=obstacle),
+        TypeError,
+        "ufl.as_vector([displacement, 0.0])",
     )
 
 

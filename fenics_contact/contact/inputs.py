@@ -1,4 +1,4 @@
-"""What the user gives of a contact, as UFL: numbers become constants, so that they may change."""
+"""User data of a contact as UFL: numbers become constants, whose values may be changed."""
 
 from __future__ import annotations
 
@@ -29,26 +29,25 @@ from fenics_contact.types import Array, Indices
 
 __all__ = ["FreeMotion", "Inputs", "check_data", "is_varying"]
 
-
 logger = logging.getLogger("fenics_contact")
 
-# What a contact itself is given by these names, among which a law's parameters stand.
-_OWN = ("angle", "displacement", "gap", "moment", "obstacle", "weight")
-# The size of the mesh times this is a penetration that no mesh has.
-_DEEP = 0.1
+# Names of the contact's own data, which parameters of a law must not have.
+_RESERVED_NAMES = ("angle", "displacement", "gap", "moment", "obstacle", "weight")
+# Initial penetration relative to the mesh size above which the normal points the wrong way.
+_DEEP_PENETRATION_RATIO = 0.1
 
 
 @dataclass(frozen=True)
 class FreeMotion:
-    """An unknown of a rigid obstacle, which systems have as a length with a force on it.
+    """An unknown displacement or rotation of a rigid obstacle, scaled to a length and a force.
 
     Attributes:
         way: "along x", or "about its axis".
-        constant: What is found: a displacement (length), or an angle.
-        load: What is given: the force or moment, as it is now.
-        length: The angle times this is the unknown, the moment by it the force; else 1. A power of
-            two, so that there is no round-off in it.
-        turns: Whether it is an angle.
+        constant: The unknown: a displacement (length) or an angle.
+        load: Returns the given force or moment.
+        length: Scale of an angle, which times it is the unknown; the moment by it is the force. It
+            is 1 for displacements, and a power of two, to avoid round-off.
+        turns: Whether the unknown is an angle.
     """
 
     way: str
@@ -59,7 +58,7 @@ class FreeMotion:
 
     @property
     def kind(self) -> str:
-        """In a word."""
+        """The kind of motion, "rotation" or "translation"."""
         return "rotation" if self.turns else "translation"
 
     @property
@@ -68,44 +67,44 @@ class FreeMotion:
         return float(self.constant.value) * self.length
 
     def set_value(self, value: float) -> None:
-        """Make an unknown the present one."""
+        """Set the unknown (length)."""
         self.constant.value = value / self.length
 
     @property
     def force(self) -> float:
-        """What acts on it (force)."""
+        """The given force (force)."""
         load = self.load()
         return float(load.value if isinstance(load, fem.Constant) else load) / self.length
 
 
 class Inputs:
-    """Weight, parameters of the law and displacement of the obstacle, as UFL.
+    """Weight, parameters of the law and motion of the obstacle, as UFL.
 
     The constructor is collective.
 
     Args:
-        accuracy: Determines the stiffness where the user does not.
-        opposite: This rank's facets of the other body; None: the obstacle is rigid.
+        accuracy: Accuracy that determines the default stiffness.
+        opposite: This rank's facets of the opposing body; None if the obstacle is rigid.
 
     Attributes:
         constants: Every parameter given by a number, by name; see `Contact.parameters`.
         stiffness_factor: Factor of k_n and k_t.
         weight: Factor of the surface measure, 1 by default.
         law: Parameters of the law, by name.
-        shift: Displacement of the obstacle; None: it has none.
-        rotation: Matrix of its turn, and a point of the axis; None: it does not turn.
-        angle: Of that turn (radians); None likewise.
-        axis: Direction of the axis, in space; None: it does not turn, or in the plane.
-        free_motion: Components of it that are unknown, as constants by number.
-        free_shift: The same as variables, to differentiate by.
-        applied_force: The forces on these.
-        free_angle: That of the turn, where it is unknown; else None.
-        applied_moment: What turns it then.
+        shift: Displacement of the obstacle; None if it has none.
+        rotation: Rotation matrix and a point of the axis; None if the obstacle does not rotate.
+        angle: Rotation angle (radians); None without rotation.
+        axis: Direction of the axis in space; None in the plane and without rotation.
+        free_motion: Unknown components of the displacement, constants by number.
+        free_shift: The same components as variables, to differentiate by.
+        applied_force: The forces on these components.
+        free_angle: The unknown rotation angle; None if it is not free.
+        applied_moment: The moment about the axis of a free rotation.
         motions: All unknowns of the obstacle, displacements first.
 
     Raises:
         ValueError: A number is out of range, or a shape is wrong.
-        TypeError: Something is neither number nor UFL.
+        TypeError: A parameter is neither a number nor UFL.
     """
 
     def __init__(
@@ -122,26 +121,28 @@ class Inputs:
         self._name, self._law, self._quadrature = name, law, quadrature
         self._surface, self._accuracy = quadrature.surface, accuracy
         self._gdim = self._surface.mesh.geometry.dim
-        self._scale: fem.Function | None = None  # E/h, if a stiffness is RelativeStiffness
-        self._scale_known = False
+        self._stiffness_scale: fem.Function | None = (
+            None  # E/h, if a stiffness is RelativeStiffness
+        )
+        self._has_modulus = False
         self._opposite = opposite
-        self._tributary: VertexAreas | None = None  # if a stiffness is that of NodalSprings
+        self._vertex_areas: VertexAreas | None = None  # if a stiffness is that of NodalSprings
         self.constants: dict[str, fem.Constant] = {}
         self.weight = self.scalar("weight", 1.0 if weight is None else weight)
-        for own in [n for n in _OWN if n in law.parameters()]:
+        for key in [n for n in _RESERVED_NAMES if n in law.parameters()]:
             raise ValueError(
-                f"{name}: {type(law).__name__} has a parameter {own!r}, which is a name of the "
+                f"{name}: {type(law).__name__} has a parameter {key!r}, which is a name of the "
                 "contact's own data; rename it"
             )
-        found = {n: self._parameter(n, v) for n, v in law.parameters().items()}
-        self.law = Parameters(law, found)
+        parameters = {n: self._make_parameter(n, v) for n, v in law.parameters().items()}
+        self.law = Parameters(law, parameters)
         self.stiffness_factor = fem.Constant(self._surface.mesh, 1.0)
         for n in {"k_n", "k_t"} & set(self.law):
             self.law[n] = self.stiffness_factor * self.law[n]
         self.free_motion: dict[int, fem.Constant] = {}
         self.free_shift: dict[int, ufl.core.expr.Expr] = {}
         self.applied_force: dict[int, Any] = {}
-        self.shift = self._displacement(obstacle.displacement)
+        self.shift = self._make_shift(obstacle.displacement)
         self.angle: Any = None
         self.motions = [
             FreeMotion(f"along {'xyz'[i]}", constant, partial(self.applied_force.get, i))
@@ -150,18 +151,18 @@ class Inputs:
         self.axis: Any = None
         self.free_angle: fem.Constant | None = None
         self.applied_moment: fem.Constant | None = None
-        self.rotation = self._rotation(obstacle.rotation)
+        self.rotation = self._make_rotation(obstacle.rotation)
 
     # ---- as UFL ----------------------------------------------------------------------------------
 
     @property
     def per_thickness(self) -> bool:
-        """Whether integrals are per unit thickness: in the plane, where the weight is 1."""
+        """Whether integrals are per unit thickness: in the plane with a weight of 1."""
         weight = self.weight
         return self._gdim == 2 and isinstance(weight, fem.Constant) and float(weight.value) == 1.0
 
     def scalar(self, name: str, value: Any) -> ufl.core.expr.Expr:
-        """A number, constant or UFL scalar as UFL."""
+        """Return a number, constant or UFL scalar as UFL."""
         expression = self.to_ufl(name, value)
         if expression.ufl_shape != ():
             raise ValueError(
@@ -170,20 +171,20 @@ class Inputs:
         return expression
 
     def to_ufl(self, name: str, value: Any) -> ufl.core.expr.Expr:
-        """Numbers become constants of the mesh, so that their value is not compiled in."""
+        """Return UFL; numbers become constants of the mesh, so that values are not compiled in."""
         if isinstance(value, ufl.core.expr.Expr):
             return value
         try:
-            # NumPy has no integers as large as Python's, which are numbers like others.
+            # Python's integers may be too large for NumPy's.
             array = np.asarray(float(value) if type(value) is int else value)
-        except (ValueError, OverflowError):  # a ragged list, a number beyond all
+        except (ValueError, OverflowError):  # a ragged list, a number out of range
             array = np.asarray(None)
         if array.dtype.kind not in "iuf":
-            rows = isinstance(value, list | tuple)
-            if rows:  # numbers of UFL's objects differ from rank to rank
-                symbols = (isinstance(v, ufl.core.expr.Expr) for v in value)
-                value = [type(v).__name__ if s else v for v, s in zip(value, symbols, strict=True)]
-            of_components = ", such as ufl.as_vector([way, 0.0])" if rows else ""
+            is_sequence = isinstance(value, list | tuple)
+            if is_sequence:  # the numbering of UFL objects differs between ranks
+                is_ufl = (isinstance(v, ufl.core.expr.Expr) for v in value)
+                value = [type(v).__name__ if s else v for v, s in zip(value, is_ufl, strict=True)]
+            of_components = ", such as ufl.as_vector([displacement, 0.0])" if is_sequence else ""
             raise TypeError(
                 f"{self._name}: {name} is {value!r}; it must be a number or numbers, a "
                 f"fem.Constant, a fem.Function or a UFL expression{of_components}"
@@ -193,32 +194,32 @@ class Inputs:
             self.constants[name] = constant
         return constant
 
-    def _parameter(self, name: str, value: Any) -> ufl.core.expr.Expr:
+    def _make_parameter(self, name: str, value: Any) -> ufl.core.expr.Expr:
         if name == "direction":
             return self.to_ufl(
                 name, nonzero_vector(f"{self._name}: direction of friction", value, self._gdim)
             )
         if isinstance(value, NodalSprings):
-            if self._tributary is None:
-                self._tributary = VertexAreas(self._quadrature, self.weight, self._name)
-            return self.to_ufl(name, value.k) / self._tributary.area
+            if self._vertex_areas is None:
+                self._vertex_areas = VertexAreas(self._quadrature, self.weight, self._name)
+            return self.to_ufl(name, value.k) / self._vertex_areas.area
         if isinstance(value, RelativeStiffness):
-            if self._scale is None:
+            if self._stiffness_scale is None:
                 space = fem.functionspace(self._surface.submesh, ("Lagrange", 1))
-                self._scale = fem.Function(space)
-                self._scale.x.array[:] = 1.0
+                self._stiffness_scale = fem.Function(space)
+                self._stiffness_scale.x.array[:] = 1.0
             factor = self._accuracy.factor if self._accuracy else DEFAULT_FACTOR
-            return self.to_ufl(name, value.factor or factor) * self._scale
+            return self.to_ufl(name, value.factor or factor) * self._stiffness_scale
         positive = name in self._law.positive
         if is_number(value):
-            bad = not np.isfinite(value) or value < 0 or (positive and value == 0)
-            if bad:
-                raise ValueError(_range_error(self._name, name, float(value), positive))
+            is_invalid = not np.isfinite(value) or value < 0 or (positive and value == 0)
+            if is_invalid:
+                raise ValueError(_range_message(self._name, name, float(value), positive))
         return self.scalar(name, value)
 
-    def _displacement(self, displacement: Any) -> Any:
+    def _make_shift(self, displacement: Any) -> Any:
         if isinstance(displacement, Motion):
-            return self._moving(displacement)
+            return self._make_free_shift(displacement)
         if displacement is None:
             return None
         shift = self.to_ufl("displacement", displacement)
@@ -229,7 +230,7 @@ class Inputs:
             )
         return shift
 
-    def _rotation(self, rotation: Rotation | None) -> tuple[Any, Any] | None:
+    def _make_rotation(self, rotation: Rotation | None) -> tuple[Any, Any] | None:
         if rotation is None:
             return None
         check_instance(f"{self._name}: rotation", rotation, Rotation)
@@ -241,14 +242,14 @@ class Inputs:
             )
         about = as_vector(f"{self._name}: about of the Rotation", rotation.about, self._gdim)
         axis = rotation.unit_axis(self._gdim)
-        angle = self._turning(rotation, about) if given[0] is None else given[0]
+        angle = self._make_free_angle(rotation, about) if given[0] is None else given[0]
         self.angle = self.to_ufl("angle", angle)
         matrix = rotation.matrix(self._gdim, self.angle)
         self.axis = self.to_ufl("obstacle", axis) if self._gdim == 3 else None
         return matrix, self.to_ufl("obstacle", about)
 
-    def _turning(self, rotation: Rotation, about: Any) -> fem.Constant:
-        """The angle of an obstacle that is turned by a moment. Collective."""
+    def _make_free_angle(self, rotation: Rotation, about: Any) -> fem.Constant:
+        """Return the unknown angle of an obstacle that a moment rotates. Collective."""
         moment = rotation.moment
         if not (is_number(moment) or (isinstance(moment, fem.Constant) and not moment.ufl_shape)):
             raise TypeError(
@@ -262,7 +263,7 @@ class Inputs:
             )
         self.applied_moment = self.to_ufl("moment", moment)
         self.free_angle = fem.Constant(self._surface.mesh, 0.0)
-        # Nodes, whose coordinates are the same on any number of ranks.
+        # Coordinates of nodes do not depend on the number of ranks.
         arms = self._surface.submesh.geometry.x[:, : self._gdim] - about
         reach = np.linalg.norm(rotation.rate(arms), axis=1)
         _, exponent = math.frexp(global_max(self._surface.mesh.comm, reach))
@@ -274,8 +275,8 @@ class Inputs:
         )
         return self.free_angle
 
-    def _moving(self, motion: Motion) -> ufl.core.expr.Expr:
-        """The displacement of an obstacle some components of which are unknown."""
+    def _make_free_shift(self, motion: Motion) -> ufl.core.expr.Expr:
+        """Return the displacement of an obstacle with unknown components."""
         forces, given = motion.components(self._gdim)
         shift: list[Any] = [None] * self._gdim
         for i, value in given.items():
@@ -292,17 +293,17 @@ class Inputs:
         return ufl.as_vector(shift)
 
     def prescribed_shift(self) -> Any:
-        """Displacement of the obstacle without its free components."""
+        """Return the displacement of the obstacle without its free components."""
         if self.shift is None:
             return ufl.as_vector([0.0] * self._gdim)
         return ufl.replace(self.shift, {c: ufl.as_ufl(0.0) for c in self.free_motion.values()})
 
-    # ---- what is measured ------------------------------------------------------------------------
+    # ---- stiffness -------------------------------------------------------------------------------
 
     @property
     def needs_modulus(self) -> bool:
-        """Whether a stiffness is `RelativeStiffness` and still waits for `set_modulus`."""
-        return self._scale is not None and not self._scale_known
+        """Whether a stiffness is `RelativeStiffness` and `set_modulus` was not called."""
+        return self._stiffness_scale is not None and not self._has_modulus
 
     def set_modulus(self, modulus: Any) -> None:
         """Set Young's modulus E of `RelativeStiffness`. Collective.
@@ -310,7 +311,7 @@ class Inputs:
         Args:
             modulus: A number, or a function with one value per cell (stress).
         """
-        if self._scale is None:
+        if self._stiffness_scale is None:
             return
         if not isinstance(modulus, fem.Function):
             what = "a positive number, or a fem.Function with one value per cell"
@@ -319,25 +320,25 @@ class Inputs:
             modulus = fem.Function(fem.functionspace(self._surface.mesh, ("DG", 0)))
             modulus.x.array[:] = value
         scale = modulus_over_height(self._surface, modulus, self._opposite)
-        self._scale.x.array[:] = scale.x.array
-        self._scale_known = True
+        self._stiffness_scale.x.array[:] = scale.x.array
+        self._has_modulus = True
 
     def update(self) -> None:
-        """Measure again what depends on data that may have changed. Collective."""
-        if self._tributary is not None:
-            self._tributary.update()
+        """Update vertex areas, whose weight may have changed. Collective."""
+        if self._vertex_areas is not None:
+            self._vertex_areas.update()
 
     # ---- checks ----------------------------------------------------------------------------------
 
     def check(self, data: Mapping[str, Array], *, undeformed: bool) -> None:
-        """Refuse what is out of range or not finite at some point of Γc. Collective.
+        """Check that all data are finite and in range at every point of Γc. Collective.
 
         Args:
-            data: As sampled at the points, by name; see `PointValues`.
+            data: Samples at the points, by name; see `PointValues`.
             undeformed: Whether gap and normal of the undeformed Γc are used.
 
         Raises:
-            ValueError: On all ranks.
+            ValueError: Data are invalid; raised on all ranks.
         """
         comm = self._surface.mesh.comm
         prefix = "parameter "
@@ -348,7 +349,7 @@ class Inputs:
                 f"{self._name}: the normal of the obstacle has length {shortest:g} at a point of "
                 "Γc; it must not vanish anywhere, and point from the body to the obstacle"
             )
-        # Only what was given: what follows from u is checked with u.
+        # Only user data: fields that depend on u are checked with u.
         weight = data["weight"]
         given = {"weight": weight, "displacement of the obstacle": data["shift"]}
         given |= {name: data[name] for name in ("angle", "about") if name in data}
@@ -365,7 +366,7 @@ class Inputs:
                 continue
             positive = name in self._law.positive
             if low < 0 or (low == 0 and positive):
-                raise ValueError(_range_error(self._name, name, low, positive))
+                raise ValueError(_range_message(self._name, name, low, positive))
         least = global_min(comm, weight)
         if least < 0:
             raise ValueError(
@@ -386,13 +387,13 @@ class Inputs:
             self._check_direction(parameters["direction"], data["normal"])
 
     def check_side(self, values: PointValues, *, gap_prescribed: bool) -> None:
-        """Refuse, or warn of, an obstacle that all of Γc looks away from. Collective.
+        """Reject or warn of a normal that points into the body on all of Γc. Collective.
 
         Raises:
-            ValueError: The body is deep inside of it, too.
+            ValueError: The body is also deep inside the obstacle.
         """
         comm = self._surface.mesh.comm
-        if global_max(comm, values.facing) > -FLAT:  # NaN has its own errors
+        if global_max(comm, values.facing) > -FLAT:  # NaN is reported elsewhere
             return
         x, depth = self._surface.mesh.geometry.x, -global_min(comm, values.initial_gap)
         text = (
@@ -401,16 +402,16 @@ class Inputs:
             "floor; a Ball or Cylinder around the body has inside=True)"
         )
         size = global_max(comm, x) - global_min(comm, x)
-        if depth > _DEEP * size and not gap_prescribed:
+        if depth > _DEEP_PENETRATION_RATIO * size and not gap_prescribed:
             raise ValueError(f"{text}; the body is inside of the obstacle, by up to {depth:g}")
         if comm.rank == 0:
             logger.warning(text)
 
     def _check_direction(self, given: Array, normal: Array) -> None:
         length = np.linalg.norm(given, axis=1)
-        across = np.linalg.norm(given - np.sum(given * normal, axis=1)[:, None] * normal, axis=1)
-        share = across / np.where(length > 0, length, 1.0)
-        least = global_min(self._surface.mesh.comm, share, empty=1.0)
+        tangent = np.linalg.norm(given - np.sum(given * normal, axis=1)[:, None] * normal, axis=1)
+        fraction = tangent / np.where(length > 0, length, 1.0)
+        least = global_min(self._surface.mesh.comm, fraction, empty=1.0)
         if not least > FLAT:
             raise ValueError(
                 f"{self._name}: direction of friction is zero or parallel to the normal at a "
@@ -421,7 +422,7 @@ class Inputs:
 
 
 def is_varying(value: Any) -> bool:
-    """Whether a number or UFL may differ from place to place."""
+    """Whether a number or UFL expression may vary in space."""
     if not isinstance(value, ufl.core.expr.Expr):
         return False
     places = (ufl.classes.Coefficient, ufl.classes.GeometricQuantity)
@@ -434,14 +435,15 @@ def check_data(
     quadrature: SurfaceQuadrature,
     displacement: Displacement,
 ) -> None:
-    """Refuse data that are none at the points of Γc while an increment is solved.
+    """Check that data have values at the points of Γc that are constant within an increment.
 
-    Points see numbers, so that data cannot depend on the ``displacement`` that is solved for.
+    The law is evaluated with these values, so that data cannot depend on the unknown
+    ``displacement``.
 
     Raises:
-        ValueError: It names what depends on what.
+        ValueError: Data have no such values.
     """
-    solved_for = displacement.whole.x.array, displacement.u.x.array
+    unknowns = displacement.whole.x.array, displacement.u.x.array
     for what, expression in given.items():
         for item in traverse_unique_terminals(ufl.as_ufl(expression)):
             if isinstance(item, ufl.Argument):
@@ -457,7 +459,7 @@ def check_data(
             if not isinstance(item, fem.Function):
                 continue
             _check_space(f"{name}: {what}", item, quadrature)
-            if any(np.shares_memory(item.x.array, array) for array in solved_for):
+            if any(np.shares_memory(item.x.array, array) for array in unknowns):
                 raise ValueError(
                     f"{name}: {what} depends on the unknown {item.name!r}, but data are constant "
                     "within an increment: use another function, whose values you set between "
@@ -467,7 +469,7 @@ def check_data(
 
 
 def _check_space(what: str, function: fem.Function, quadrature: SurfaceQuadrature) -> None:
-    """Refuse a function that has no value at the points."""
+    """Check that a function has values at the points."""
     surface = quadrature.surface
     mesh, element = function.function_space.mesh, function.function_space.ufl_element()
     on_surface = mesh is surface.submesh or mesh == surface.submesh
@@ -477,16 +479,16 @@ def _check_space(what: str, function: fem.Function, quadrature: SurfaceQuadratur
         )
     if not element.has_custom_quadrature:
         return
-    own = quadrature.space().ufl_element().custom_quadrature()[0]
+    expected = quadrature.space().ufl_element().custom_quadrature()[0]
     points = element.custom_quadrature()[0]
-    if not (on_surface and points.shape == own.shape and np.array_equal(points, own)):
+    if not (on_surface and points.shape == expected.shape and np.array_equal(points, expected)):
         raise ValueError(
             f"{what} has a function, {function.name!r}, on a quadrature element with other points "
             "than those of Γc; use a function of a Lagrange or DG space"
         )
 
 
-def _range_error(contact: str, name: str, value: float, positive: bool) -> str:
-    wanted = "greater than zero" if positive else "zero or greater"
-    wanted += " (stress/length)" if name.startswith("k_") else ""
-    return f"{contact}: {name} is {value:g} at a point of Γc; it must be finite and {wanted}"
+def _range_message(contact: str, name: str, value: float, positive: bool) -> str:
+    condition = "greater than zero" if positive else "zero or greater"
+    condition += " (stress/length)" if name.startswith("k_") else ""
+    return f"{contact}: {name} is {value:g} at a point of Γc; it must be finite and {condition}"

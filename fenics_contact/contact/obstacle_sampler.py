@@ -113,7 +113,7 @@ class ObstacleSampler:
         return np.asarray(np.linalg.norm(gradient + normal, axis=1))
 
     def _sample(self, position: Array, time: Array | float) -> tuple[Array, Array, Array]:
-        """Return distance, normal and gradient of an obstacle in UFL, as `sample` does. Collective."""
+        """Return distance, normal and gradient of an obstacle in UFL. Collective."""
         n, d = position.shape
         if self._evaluator is None:
             self._evaluator = PointEvaluator(self._quadrature, self._expressions)

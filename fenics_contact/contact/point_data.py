@@ -82,7 +82,7 @@ class PointData:
 def _find_uncompilable(
     quadrature: SurfaceQuadrature, expressions: Mapping[str, ufl.core.expr.Expr]
 ) -> str | None:
-    """The first expression that does not compile, and why; None: nothing does. Collective."""
+    """Return the first expression that does not compile, and why, or None. Collective."""
     comm = quadrature.surface.mesh.comm
     for name, expression in {"": ufl.as_ufl(1.0), **expressions}.items():
         try:
