@@ -137,7 +137,7 @@ class Multipliers:
         self._excluded_part = part
 
     def error(self, values: PointValues, history: PointFields, moved: Array) -> float:
-        """Return the relative change by an augmentation, `Contact.enforcement_error`. Collective."""
+        """Return `Contact.enforcement_error` of an evaluated state. Collective."""
         projected = self._projected(values)
         names = [n for n in ("normal_traction", "traction") if n in history]
 

@@ -27,7 +27,6 @@ from fenics_contact.types import Array
 
 __all__ = ["PointResults"]
 
-
 # Results that are functions on Γc.
 _FUNCTIONS = ("pressure", "traction", "tangential_traction", "gap", "slip", "normal")
 
@@ -117,7 +116,7 @@ class PointResults(ABC):
         Raises:
             numpy.linalg.LinAlgError: K_t is singular; raised on all ranks.
         """
-        with collective_errors(self.surface.mesh.comm):  # singular, where k_t is next to nothing
+        with collective_errors(self.surface.mesh.comm):
             return self.values.slip_vector
 
     @property
@@ -175,10 +174,10 @@ class PointResults(ABC):
         arm = places - as_vector(f"{self.name}: about", about, places.shape[1])
         force = self.measure[:, None] * self.traction
         if places.shape[1] == 3:
-            turn = np.cross(arm, force)
+            moment = np.cross(arm, force)
         else:
-            turn = (arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0])[:, None]
-        return global_sum(self.surface.mesh.comm, turn.sum(axis=0))
+            moment = (arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0])[:, None]
+        return global_sum(self.surface.mesh.comm, moment.sum(axis=0))
 
     def area_stretch(self) -> Array:
         """Return the area ratio |J F⁻ᵀ N| with F = I + grad u, (n_points,). Collective.
@@ -281,11 +280,11 @@ class PointResults(ABC):
             "slip": status == Status.SLIP,
         }
         areas = global_sum(comm, [self.measure @ points for points in states.values()])
-        mine = [
+        local_ends = [
             (x[points].min(axis=0, initial=np.inf), x[points].max(axis=0, initial=-np.inf))
             for points in states.values()
         ]
-        ends = np.array(comm.allgather(mine))  # by rank and state
+        ends = np.array(comm.allgather(local_ends))  # by rank and state
         low, high = ends[:, :, 0].min(axis=0), ends[:, :, 1].max(axis=0)
         low, high = (np.where(low <= high, end, np.nan) for end in (low, high))
         rows = zip(states, areas, low, high, strict=True)

@@ -28,14 +28,14 @@ class Status(IntEnum):
 class ZoneExtent:
     """Extent of a zone of Γc (contact, stick or slip), the same on every rank.
 
-    Coordinates are those of the outermost quadrature points: the zone ends between these and the
-    next points, less than one facet farther.
+    Coordinates are those of the outermost quadrature points; the zone ends less than one facet
+    beyond these.
 
     Attributes:
         area: Area of the zone, including the contact's weight; in the plane with a weight of 1
             (default), per unit thickness.
         low, high: Smallest and largest coordinates of its points on the undeformed Γc, (gdim,)
-            (length); NaN if there are none.
+            (length); NaN if it is empty.
     """
 
     area: float
@@ -88,46 +88,45 @@ class Resultants:
 class PointValues:
     """Fields at this rank's points at one state, (n_points,) or (n_points, gdim).
 
-    What the law has no use for is zero, and takes no memory.
+    Fields that the law does not determine are zero, and take no memory.
 
     Attributes:
-        x: Places of the points (length).
-        normal: Unit normal n from body to obstacle.
-        facing: n by the outward normal of the body.
+        x: Undeformed positions of the points (length).
+        normal: Unit normal n from the body to the obstacle.
+        facing: Scalar product of n and the outward normal of the body.
         weight: Factor of the surface measure.
-        initial_gap: s (length), the motion of the obstacle included.
-        shift: Displacement of the obstacle as far as it is prescribed (length).
-        parameters: Of the law, by name.
-        paired: Whether the point has an opposite; 1 or 0.
-        depth: How deep it is in the opposite body, whatever gap is prescribed (length).
-        slide: Tangential displacement relative to it since the pairs were found (length).
+        initial_gap: s (length), including the motion of the obstacle.
+        shift: Prescribed displacement of the obstacle (length).
+        parameters: Parameters of the law, by name.
+        paired: 1 if the point has an opposite point, otherwise 0.
+        depth: Penetration into the opposing body, without a prescribed gap (length).
+        slide: Tangential jump since the pairs were found (length).
         jump: Displacement relative to the obstacle (length).
         normal_displacement: u_n (length).
         opening, penetration: δ₊ and δ₋ (length).
         normal_traction: r_n (stress).
         normal_stiffness: -∂r_n/∂u_n where closed (stress/length).
-        normal_reaction: r_n by the law's own potential, where it has one (stress).
+        normal_reaction: r_n by the law's own potential, if it has one (stress).
         traction: τ on the body (stress).
-        friction_bound_ratio: Bound of |τ|/p over all directions; infinite where tangential forces
-            are not bounded by normal ones, 0 where nothing resists motion along Γc.
-        circumradius: Largest |τ| on the yield surface, by its friction bound; infinite where it is
-            not known.
-        stored: Energy in the springs per area.
+        friction_bound_ratio: Bound of |τ|/p over all directions; infinite if |τ| is not bounded by
+            the pressure, 0 without tangential resistance.
+        circumradius: Largest |τ| on the yield surface, relative to its friction bound; infinite if
+            unknown.
+        stored: Elastic energy of the contact per area.
         increment: Δu_t since the last commit (length).
-        old_traction: τ that the increment started from (stress).
+        old_traction: τ at the start of the increment (stress).
         friction_bound: Size of the yield surface (stress).
-        bound_of_law: The same by `Law.friction_bound` at the contact pressure (stress).
+        bound_of_law: `Law.friction_bound` at the contact pressure (stress).
         friction_bound_slope: Its derivative by the pressure.
-        dissipated: Work of friction per area.
+        dissipated: Frictional dissipation per area.
         slip_increment: Δβ of every mode, (n_points, n_modes) (length).
         multiplier: λ_n (stress).
-        elastic_slip: What multipliers leave of K_t⁻¹ τ (length), as the history has it.
-        projection_point: Displacement of what the history measures slip by, in the frame of the
-            obstacle (length): the jump, or with finite kinematics that of the closest point of the
-            obstacle.
+        elastic_slip: K_t⁻¹ (λ_t - τ) (length), in the frame of the history.
+        projection_point: Displacement by which the history measures slip, in the frame of the
+            obstacle (length): the jump, or with finite kinematics that of the projection point.
         framed_traction, framed_normal: τ (stress) and n in the frame of the obstacle.
-        carried_traction: The committed τ as obstacle and normal have turned it since (stress).
-        arrays: All that was evaluated, by name, for files.
+        carried_traction: The committed τ, rotated with obstacle and normal since (stress).
+        arrays: All evaluated fields by name, for files.
     """
 
     x: Array
@@ -168,7 +167,7 @@ class PointValues:
 
     @classmethod
     def of(cls, arrays: Mapping[str, Array]) -> PointValues:
-        """Sort arrays by name: "parameter NAME" are parameters."""
+        """Return the values of evaluated arrays; "parameter NAME" are parameters."""
         n, d = arrays["x"].shape
         parameters = {
             name.removeprefix("parameter "): values
@@ -176,29 +175,25 @@ class PointValues:
             if name.startswith("parameter ")
         }
         zero, zeros = (np.broadcast_to(0.0, shape) for shape in ((n,), (n, d)))
-        # What some laws have no use for; all else is always evaluated.
+        # Members that some laws do not need; all others are always evaluated.
         scalars = (
             *("normal_reaction", "friction_bound_ratio", "circumradius", "friction_bound"),
             *("bound_of_law", "friction_bound_slope", "dissipated", "multiplier", "depth"),
         )
         vectors = ("slide", "traction", "increment", "old_traction", "elastic_slip")
-        found: dict[str, Any] = dict.fromkeys(scalars, zero) | dict.fromkeys(vectors, zeros)
-        found["paired"] = np.broadcast_to(1.0, (n,))
-        found["normal_stiffness"] = parameters.get("k_n", zero)
-        found["slip_increment"] = np.broadcast_to(0.0, (n, 0))
-        found |= {f.name: arrays[f.name] for f in fields(cls) if f.name in arrays}
-        # With small displacements the history is in space.
-        kept = {
-            "projection_point": "jump",
-            "framed_traction": "traction",
-            "framed_normal": "normal",
-        }
-        kept |= {"carried_traction": "old_traction"}
-        found |= {name: found[other] for name, other in kept.items() if name not in arrays}
-        return cls(**found | {"parameters": parameters, "arrays": arrays})
+        members: dict[str, Any] = dict.fromkeys(scalars, zero) | dict.fromkeys(vectors, zeros)
+        members["paired"] = np.broadcast_to(1.0, (n,))
+        members["normal_stiffness"] = parameters.get("k_n", zero)
+        members["slip_increment"] = np.broadcast_to(0.0, (n, 0))
+        members |= {f.name: arrays[f.name] for f in fields(cls) if f.name in arrays}
+        # The frame of the history is fixed in space with small displacements.
+        aliases = {"projection_point": "jump", "carried_traction": "old_traction"}
+        aliases |= {"framed_traction": "traction", "framed_normal": "normal"}
+        members |= {name: members[other] for name, other in aliases.items() if name not in arrays}
+        return cls(**members | {"parameters": parameters, "arrays": arrays})
 
     def at(self, points: Mask) -> PointValues:
-        """Those of some of the points."""
+        """Return the values at some of the points."""
         return self.of({name: values[points] for name, values in self.arrays.items()})
 
     @cached_property
@@ -218,64 +213,64 @@ class PointValues:
     @property
     def friction_secant(self) -> Array:
         """Secant stiffness of friction relative to K_t, (n_points,): 1 at sticking points."""
-        stuck = self.old_traction - np.einsum(
+        stick = self.old_traction - np.einsum(
             "qij,qj->qi", self.tangential_stiffness, self.increment
         )
-        borne, trial = (np.linalg.norm(v, axis=1) for v in (self.traction, stuck))
-        return np.where(trial > 0, borne / np.where(trial > 0, trial, 1.0), 1.0)
+        traction, trial = (np.linalg.norm(v, axis=1) for v in (self.traction, stick))
+        return np.where(trial > 0, traction / np.where(trial > 0, trial, 1.0), 1.0)
 
     @property
     def slips(self) -> Mask:
-        """Which points slip against friction, open ones too if it acts there, (n_points,)."""
+        """Mask of the points that slip against friction, including open ones, (n_points,)."""
         return np.asarray(np.any(self.slip_increment != 0, axis=1))
 
     def springs(self, normal: npt.ArrayLike, tangential: npt.ArrayLike) -> Array:
         """Return the symmetric stiffness a K_n + b K_t of the quasi-Newton method at the points.
 
         Args:
-            normal: The factor a, a number or one per point of this rank.
-            tangential: The factor b, a number or one per point of this rank.
+            normal: Factor a, a number or (n_points,).
+            tangential: Factor b, a number or (n_points,).
 
         Returns:
             Array (n_points, gdim, gdim) (stress/length).
         """
-        along = np.einsum("qi,qj->qij", self.normal, self.normal)
+        projector = np.einsum("qi,qj->qij", self.normal, self.normal)
         stiffness = np.asarray(normal) * self.normal_stiffness
-        share = np.broadcast_to(np.asarray(tangential), self.normal_stiffness.shape)
+        factor = np.broadcast_to(np.asarray(tangential), self.normal_stiffness.shape)
         return np.asarray(
-            stiffness[:, None, None] * along + share[:, None, None] * self.tangential_stiffness
+            stiffness[:, None, None] * projector + factor[:, None, None] * self.tangential_stiffness
         )
 
     @property
     def total_traction(self) -> Array:
-        """r_n n + τ on the body."""
+        """Total traction r_n n + τ on the body (stress)."""
         return self.normal_traction[:, None] * self.normal + self.traction
 
     @cached_property
     def slip_vector(self) -> Array:
-        """Slip Δu_t + K_t⁻¹ Δτ of the increment; Δu_t where the law has no k_t.
+        """Slip Δu_t + K_t⁻¹ Δτ of the increment; Δu_t if the law has no k_t.
 
         Raises:
-            numpy.linalg.LinAlgError: k_t is next to nothing.
+            numpy.linalg.LinAlgError: K_t is singular.
         """
         if "k_t" not in self.parameters:
             return self.increment
-        # K_t has no inverse along the normal, and nothing acts there: any stiffness will do.
-        along = np.einsum("q,qi,qj->qij", self.parameters["k_t"], self.normal, self.normal)
+        # K_t is singular along the normal, where nothing acts: add any stiffness.
+        projector = np.einsum("q,qi,qj->qij", self.parameters["k_t"], self.normal, self.normal)
         change = (self.traction - self.old_traction)[:, :, None]
-        stretched = np.linalg.solve(self.tangential_stiffness + along, change)[:, :, 0]
-        return np.asarray(self.increment + stretched, dtype=np.float64)
+        elastic = np.linalg.solve(self.tangential_stiffness + projector, change)[:, :, 0]
+        return np.asarray(self.increment + elastic, dtype=np.float64)
 
     def tangential(self, vectors: Array) -> Array:
-        """The part of vectors across the normal, (n_points, gdim)."""
+        """Return the part of vectors across the normal, (n_points, gdim)."""
         return vectors - np.sum(vectors * self.normal, axis=1)[:, None] * self.normal
 
     def status(self, *, tension: bool, sticks: bool) -> npt.NDArray[np.int8]:
-        """`Status` of every point, (n_points,); one without an opposite is open.
+        """Return the `Status` of every point, (n_points,); unpaired points are open.
 
         Args:
-            tension: Whether the law bears tension: then no point with an opposite is open.
-            sticks: Whether there are tangential tractions; without, closed points count as slip.
+            tension: Whether the law bears tension, so that no paired point is open.
+            sticks: Whether there are tangential tractions; if not, closed points count as slip.
         """
         closed = (self.paired > 0) & ((self.normal_traction < 0) | tension)
         status = np.where(closed, Status.SLIP, Status.OPEN).astype(np.int8)
