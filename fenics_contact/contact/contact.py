@@ -103,10 +103,10 @@ class Contact(PointResults):
         gap_prescribed: Whether the initial gap was given by ``gap``.
         kinematics: The argument.
         finite: Whether the kinematics are finite.
-        opposite: The contact kinematics, those of the obstacle or the opposing body.
+        contact_kinematics: Gap, normal and jump at the points, and their committed state.
         rigid: Whether the obstacle is rigid, so that its reactions are external forces.
         pairs: The pairs of points of Γc and opposite points.
-        acting: The law evaluated at the points.
+        effective_law: The law evaluated at the points.
         states: The committed state, and the results evaluated last.
 
     Raises:
@@ -154,14 +154,14 @@ class Contact(PointResults):
         self.accuracy = None if accuracy is None else Accuracy.of(accuracy)
         kinematics_type = select_kinematics(name, kinematics, obstacle, law, gap)
         self.kinematics, self.finite = kinematics, kinematics_type.is_finite
-        augments, self.tolerance = select_enforcement(
+        augmented, self.tolerance = select_enforcement(
             name, enforcement, tolerance, law, self.accuracy
         )
-        # Linear elements meet a curved gap at their nodes only (docs/enforcement.md). But between
-        # two meshes, and on quadrilaterals of any shape, nodes do not transfer a uniform pressure.
-        nodal = augments and degree == 1 and not isinstance(obstacle, DeformableBody)
+        # Linear elements can satisfy a curved gap at their nodes only (docs/enforcement.md), but
+        # nodes do not transfer a uniform pressure between two meshes, on quadrilaterals of any
+        # shape, or with a weight that varies.
+        nodal = augmented and degree == 1 and not isinstance(obstacle, DeformableBody)
         nodal = nodal and surface.submesh.topology.cell_name() != "quadrilateral"
-        # Nor with a weight that varies, where vertex areas do not integrate a uniform pressure.
         nodal = nodal and not is_varying(weight)
         opposite = None
         if isinstance(obstacle, DeformableBody):
@@ -173,10 +173,10 @@ class Contact(PointResults):
             pieces=not self.finite,
             radius=obstacle.smallest_radius,
         )
-        moving = self.finite and not isinstance(obstacle, DeformableBody)
+        has_frame = self.finite and not isinstance(obstacle, DeformableBody)
         self.multipliers: Multipliers | None = None
-        if augments:
-            self.multipliers = Multipliers(self.quadrature, degree, law, turning=moving)
+        if augmented:
+            self.multipliers = Multipliers(self.quadrature, degree, law, turning=has_frame)
         self.inputs = Inputs(
             name,
             self.quadrature,
@@ -197,13 +197,11 @@ class Contact(PointResults):
         fields = {"opening": 0, "penetration": 0, "normal_traction": 0}
         if law.has_friction:
             fields |= {"traction": gdim, "jump": gdim, "slip": law.n_modes(gdim)}
-            fields |= {"normal": gdim} if moving else {}
+            fields |= {"normal": gdim} if has_frame else {}
         if self.multipliers is not None:
             fields |= {"multiplier": 0}
         self.history = PointFields(self.quadrature, fields)
 
-        # Contact is a sparse matrix from u to the jump at the points, and the law there: as
-        # expressions for the form on Γc, and evaluated at the points for everything else.
         parts = ContactParts(
             name=name,
             displacement=self.displacement,
@@ -246,12 +244,12 @@ class Contact(PointResults):
         return self.form_at(self.displacement.expression, v)
 
     def form_at(self, displacement: Any, v: ufl.Argument) -> ufl.Form:
-        """Return `form` at a displacement relative to the obstacle (UFL)."""
+        """Return `form` at a jump (UFL)."""
         traction = self.effective_law.in_form.traction(displacement)
         return -self.inputs.weight * ufl.dot(traction, v) * self.quadrature.ds
 
     def _check_form(self) -> None:
-        """Raise a ValueError if the contact has no boundary form."""
+        """Check that the contact has a boundary form, or raise a ValueError."""
         if self.motions:
             raise ValueError(
                 f"{self.name}: the boundary form cannot contain the unknown motion of the obstacle;"
@@ -352,9 +350,10 @@ class Contact(PointResults):
         return self.pairs.n_unpaired
 
     def own_displacement(self) -> Array:
-        """Return the displacement of the body that has Γc, (n_points, gdim) (length). Collective.
+        """Return the displacement of the body of Γc at this rank's points. Collective.
 
-        It is evaluated at this rank's quadrature points.
+        Returns:
+            Array (n_points, gdim) (length).
         """
         return self.pairs.own_displacement()
 
@@ -450,6 +449,7 @@ class Contact(PointResults):
         return np.asarray(sum(np.linalg.norm(part, axis=1) for part in parts))
 
     def _augmented(self) -> Multipliers:
+        """Return the multipliers, or raise a ValueError with a penalty."""
         if self.multipliers is None:
             raise ValueError(
                 f"{self.name}: there are no multipliers with a penalty; create the contact with "

@@ -1,4 +1,4 @@
-"""General contact: finds all pairs of bodies that may come into contact, by their distance."""
+"""General contact: search for all pairs of bodies that may come into contact."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ logger = logging.getLogger("fenics_contact")
 
 LawOf: TypeAlias = Law | Callable[[Hashable, Hashable], Law]
 
-# Meshes whose facets differ in size by less are equally fine.
-_AS_FINE = 0.01
+# Relative difference of mean facet sizes below which two meshes are equally fine.
+_EQUAL_SIZE_RATIO = 0.01
 
 
 def find_contact_pairs(
@@ -93,7 +93,7 @@ def find_contact_pairs(
     _check(law, distance, bodies, facet_tags, tags, self_contact, options)
     space = Displacement(u, None, "find_contact_pairs").u.function_space
     mesh, comm = space.mesh, space.mesh.comm
-    names, of_cell = _bodies(space, bodies)
+    names, body_of_cell = _bodies(space, bodies)
     if isinstance(slave_bodies, str) or not isinstance(slave_bodies, Sequence):
         raise ValueError(
             f"slave_bodies is {slave_bodies!r}; it must be a list of bodies, of {names!r}"
@@ -105,33 +105,35 @@ def find_contact_pairs(
         facets = _boundary(mesh)
     else:
         facets = tagged_facets(mesh, facet_tags, tags)
-    label = of_cell[facet_cells(mesh, facets)]
-    found = find_neighbours(space, facets, label, distance, self_contact=self_contact)
-    if not found:
+    label = body_of_cell[facet_cells(mesh, facets)]
+    pairs = find_neighbours(space, facets, label, distance, self_contact=self_contact)
+    if not pairs:
         warn(
             comm,
             f"find_contact_pairs: no two of the bodies {names} are within {distance:g}. Check the "
             "distance; bodies that overlap by more than half a cell are not found",
         )
 
-    on = [broadcast_from_root(comm, _side_of_surface(pair, names, slave_bodies)) for pair in found]
-    roles = [pair.facets[side] for pair, side in zip(found, on, strict=True)]
-    roles += [pair.facets[1 - side] for pair, side in zip(found, on, strict=True)]
-    marks, tags_of = _marked(mesh, roles)
+    sides = [
+        broadcast_from_root(comm, _side_of_surface(pair, names, slave_bodies)) for pair in pairs
+    ]
+    sets = [pair.facets[side] for pair, side in zip(pairs, sides, strict=True)]
+    sets += [pair.facets[1 - side] for pair, side in zip(pairs, sides, strict=True)]
+    pair_tags, tags_of = _tag_facets(mesh, sets)
     contacts = []
-    for i, (pair, side) in enumerate(zip(found, on, strict=True)):
+    for i, (pair, side) in enumerate(zip(pairs, sides, strict=True)):
         a, b = (names[number] for number in pair.bodies)
         if comm.rank == 0:
-            logger.info("%s", _told(f"{a}-{b}", (a, b), pair, side))
-        chosen = law if isinstance(law, Law) else law(a, b)
-        surface = ContactSurface(mesh, marks, tags_of[i])
+            logger.info("%s", _log_message(f"{a}-{b}", (a, b), pair, side))
+        pair_law = law if isinstance(law, Law) else law(a, b)
+        surface = ContactSurface(mesh, pair_tags, tags_of[i])
         obstacle = DeformableBody(
-            marks,
-            tags_of[len(found) + i],
+            pair_tags,
+            tags_of[len(pairs) + i],
             update_pairs=update_pairs,
             max_initial_penetration=max_initial_penetration,
         )
-        contacts.append(Contact(u, surface, obstacle, chosen, name=f"{a}-{b}", **options))
+        contacts.append(Contact(u, surface, obstacle, pair_law, name=f"{a}-{b}", **options))
     return contacts
 
 
@@ -156,10 +158,10 @@ def _check(
     if (facet_tags is None) != (tags is None):
         raise ValueError("facet_tags and tags belong together; give both, or neither")
     check_bool("self_contact", self_contact)
-    own = [name for name in ("surface", "obstacle", "opposite") if name in options]
-    if own:
+    conflicting = [name for name in ("surface", "obstacle", "opposite") if name in options]
+    if conflicting:
         raise ValueError(
-            f"{' and '.join(own)} given; find_contact_pairs finds both sides of every "
+            f"{' and '.join(conflicting)} given; find_contact_pairs finds both sides of every "
             "contact: omit it, or create a Contact with these sides"
         )
     if "name" in options:
@@ -169,18 +171,18 @@ def _check(
 def _bodies(
     space: fem.FunctionSpace, bodies: JoinedMesh | dolfinx.mesh.MeshTags | None
 ) -> tuple[list[Hashable], Index]:
-    """Names of the bodies, and the number of that of every cell of this rank. Collective.
+    """Return the names of the bodies, and the number of the body of every cell. Collective.
 
     Raises:
-        ValueError: They are of another mesh, or do not cover this one.
+        ValueError: The bodies are of another mesh, or do not cover this one.
     """
     mesh = space.mesh
     comm, d = mesh.comm, mesh.topology.dim
     cells = mesh.topology.index_map(d)
     n = cells.size_local + cells.num_ghosts
     if bodies is None:
-        n_bodies, of_node = connected_bodies(space)
-        return list(range(1, n_bodies + 1)), of_node[space.dofmap.list[:n, 0]]
+        n_bodies, body_of_node = connected_bodies(space)
+        return list(range(1, n_bodies + 1)), body_of_node[space.dofmap.list[:n, 0]]
     if isinstance(bodies, JoinedMesh):
         if bodies.mesh is not mesh:
             raise ValueError("bodies are joined in another mesh than that of u; use bodies.mesh")
@@ -211,7 +213,7 @@ def _bodies(
 
 
 def _boundary(mesh: dolfinx.mesh.Mesh) -> Index:
-    """Owned facets of the boundary, ascending. Collective."""
+    """Return the owned facets of the boundary, ascending. Collective."""
     d = mesh.topology.dim
     mesh.topology.create_connectivity(d - 1, d)
     exterior = np.sort(dolfinx.mesh.exterior_facet_indices(mesh.topology))
@@ -221,39 +223,39 @@ def _boundary(mesh: dolfinx.mesh.Mesh) -> Index:
 def _side_of_surface(
     pair: Neighbours, names: Sequence[Hashable], slave_bodies: Sequence[Hashable]
 ) -> int:
-    """Which of the two sides is Γc, see `find_contact_pairs`."""
-    wanted = [list(slave_bodies).index(names[i]) for i in pair.bodies if names[i] in slave_bodies]
-    if wanted:
-        return [names[i] for i in pair.bodies].index(slave_bodies[min(wanted)])
-    one, other = pair.sizes
-    if abs(one - other) > _AS_FINE * max(one, other):
-        return int(other < one)
+    """Return the side on which Γc is placed, see `find_contact_pairs`."""
+    ranks = [list(slave_bodies).index(names[i]) for i in pair.bodies if names[i] in slave_bodies]
+    if ranks:
+        return [names[i] for i in pair.bodies].index(slave_bodies[min(ranks)])
+    first, second = pair.sizes
+    if abs(first - second) > _EQUAL_SIZE_RATIO * max(first, second):
+        return int(second < first)
     return int(pair.counts[1] < pair.counts[0])
 
 
-def _marked(
-    mesh: dolfinx.mesh.Mesh, roles: Sequence[Index]
+def _tag_facets(
+    mesh: dolfinx.mesh.Mesh, sets: Sequence[Index]
 ) -> tuple[dolfinx.mesh.MeshTags, list[list[int]]]:
-    """One tag for the facets of each set of roles, and the tags of every role. Collective.
+    """Return one set of facet tags for all contacts, and the tags of each facet set. Collective.
 
-    One set of tags for all contacts, so that their forms can be added.
+    Forms of several contacts can be added only if they have the same tags.
     """
-    facets = np.unique(np.concatenate([np.zeros(0, dtype=np.int32), *roles]))
-    has = np.zeros((len(facets), len(roles)), dtype=np.bool_)
-    for i, role in enumerate(roles):
-        has[:, i] = np.isin(facets, role)
-    known = sorted(set().union(*mesh.comm.allgather({tuple(row) for row in has.tolist()})))
+    facets = np.unique(np.concatenate([np.zeros(0, dtype=np.int32), *sets]))
+    is_member = np.zeros((len(facets), len(sets)), dtype=np.bool_)
+    for i, facet_set in enumerate(sets):
+        is_member[:, i] = np.isin(facets, facet_set)
+    known = sorted(set().union(*mesh.comm.allgather({tuple(row) for row in is_member.tolist()})))
     number = {row: tag for tag, row in enumerate(known, 1)}
-    values = np.array([number[tuple(row)] for row in has.tolist()], dtype=np.int32)
-    marks = dolfinx.mesh.meshtags(mesh, mesh.topology.dim - 1, facets.astype(np.int32), values)
-    return marks, [[number[row] for row in known if row[i]] for i in range(len(roles))]
+    values = np.array([number[tuple(row)] for row in is_member.tolist()], dtype=np.int32)
+    pair_tags = dolfinx.mesh.meshtags(mesh, mesh.topology.dim - 1, facets.astype(np.int32), values)
+    return pair_tags, [[number[row] for row in known if row[i]] for i in range(len(sets))]
 
 
-def _told(name: str, bodies: tuple[Hashable, Hashable], pair: Neighbours, side: int) -> str:
-    """A line for the log."""
-    both = "" if pair.separate else "; all facets are on both sides"
+def _log_message(name: str, bodies: tuple[Hashable, Hashable], pair: Neighbours, side: int) -> str:
+    """Return the log line of a contact."""
+    note = "" if pair.separate else "; all facets are on both sides"
     return (
         f"{name}: Γc on {bodies[side]} with {pair.counts[side]} facets of mean size "
         f"{pair.sizes[side]:.3g}, opposite on {bodies[1 - side]} with {pair.counts[1 - side]} of "
-        f"{pair.sizes[1 - side]:.3g}; {pair.least:.3g} to {pair.largest:.3g} apart{both}"
+        f"{pair.sizes[1 - side]:.3g}; {pair.least:.3g} to {pair.largest:.3g} apart{note}"
     )
