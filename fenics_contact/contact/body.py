@@ -29,11 +29,7 @@ NEGLIGIBLE_SLIDE = 1e-2
 
 
 class BodySmall(ContactKinematics):
-    """Small displacements between bodies, with pairs of the undeformed or of deformed bodies.
-
-    Args:
-        pairs: Pairs of the points; by default pairs that do not follow the bodies.
-    """
+    """Small displacements between bodies, with pairs of the undeformed or of deformed bodies."""
 
     is_rigid = False
 
@@ -168,7 +164,7 @@ class BodyFinite(BodySmall):
         assert isinstance(obstacle, DeformableBody)
         pairs = FiniteSlidingPairs(parts.name, parts.displacement.u, parts.quadrature, obstacle)
         super().__init__(parts, pairs)
-        self._finite_pairs = pairs
+        self._finite = pairs
         self.local_jump = pairs.local_jump.function
         self.in_form = self.at_points = FiniteSlidingKinematics(parts.multipliers)
 
@@ -177,14 +173,12 @@ class BodyFinite(BodySmall):
         self.update_data()
         data, history = self.data.values, self._parts.history
         self._parts.displacement.follow()
-        self._finite_pairs.update(
-            data["x"], data["normal"], history, self._parts.multipliers or history
-        )
+        self._finite.update(data["x"], data["normal"], history, self._parts.multipliers or history)
         self._update_jump()
 
     def outputs(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """Return the fields of `ContactKinematics.outputs`, with the jump since the last commit."""
-        pairs, normal = self._finite_pairs, self._finite_pairs.local_jump.values("normal")
+        pairs, normal = self._finite, self._finite.local_jump.values("normal")
         outputs = self._pair_outputs(arrays) | {"normal": normal, "jump": pairs.jump_increment()}
         if not self._parts.law.has_friction:
             return outputs
@@ -198,17 +192,15 @@ class BodyFinite(BodySmall):
         """Return the derivatives of the point forces by the local unknowns. Collective."""
         by_local_jump = law.evaluate_tangent().by_jump
         traction = law.evaluate_traction()
-        return PointTangent(
-            self._finite_pairs.tangent(by_local_jump, traction, self._parts.history)
-        )
+        return PointTangent(self._finite.tangent(by_local_jump, traction, self._parts.history))
 
     def undeformed_gap(self, values: PointValues) -> Array:
         """Return the gap of the undeformed Γc, (n_points,) (length)."""
-        return self._finite_pairs.undeformed_gap
+        return self._finite.undeformed_gap
 
     def turned(self, vectors: Array, *, back: bool = False) -> Array:
         """Return vectors rotated with the surface from the committed state, or back."""
-        return self._finite_pairs.turned(vectors, back=back)
+        return self._finite.turned(vectors, back=back)
 
     @property
     def updates_pairs(self) -> bool:
@@ -226,9 +218,9 @@ class BodyFinite(BodySmall):
 
     def reset_reference(self) -> bool:
         """Measure slip from the present ``u``; return whether the reference changes. Collective."""
-        if self._finite_pairs.is_at_commit():
+        if self._finite.is_at_commit():
             return False
-        self._finite_pairs.commit()
+        self._finite.commit()
         return True
 
     def reference_fields(self) -> dict[str, Array]:
@@ -237,7 +229,7 @@ class BodyFinite(BodySmall):
 
     def slip_reference(self, values: PointValues) -> dict[str, Array]:
         """Return V of `finite_sliding` as the reference of slip."""
-        return {"jump": self._finite_pairs.total_slip}
+        return {"jump": self._finite.total_slip}
 
     def to_history(self, fields: Mapping[str, Array]) -> dict[str, Array]:
         """Return fields of a solution with vectors rotated with the surface."""
@@ -246,12 +238,12 @@ class BodyFinite(BodySmall):
 
     def resume(self, depth: Array, evaluate: Callable[[], PointValues], *, new_pairs: bool) -> None:
         """Make the present ``u`` the committed displacement of another run. Collective."""
-        self._finite_pairs.commit()
+        self._finite.commit()
         super().resume(depth, evaluate, new_pairs=False)
 
     def commit(self, values: PointValues) -> Array | None:
         """Make an evaluated state the committed one. Collective."""
         super().commit(values)
-        self._finite_pairs.commit()
+        self._finite.commit()
         self.committed_jump = np.zeros_like(values.jump)
         return None

@@ -146,22 +146,16 @@ class ContactKinematics(ABC):
     Attributes:
         pairs: The pairs of quadrature points and opposite points.
         data: User data, sampled at the points.
-        jump: Displacement of the body at the points, minus that of an opposing body; the
-            displacement of a rigid obstacle is not subtracted.
-        local_jump: The independent variables of the laws at the points: the jump, or functions of
-            it.
-        given, sampled: Geometry and parameters of the laws, as expressions on Γc and as values at
-            the points.
-        in_form, at_points: `LocalKinematics` of laws in the form on Γc, and for values at the
-            points.
+        jump: Displacement of the body minus that of an opposing body (not of a rigid obstacle).
+        local_jump: Independent variables of the laws: the jump, or functions of it.
+        given, sampled: Geometry and parameters as expressions on Γc, and as values at the points.
+        in_form, at_points: `LocalKinematics` in the form on Γc, and for values at the points.
         committed_jump: The jump at the last commit, relative to the obstacle and between the
             present pairs, (n_points, gdim); zero before the first commit.
         committed_angle: Rotation angle of the obstacle at the last commit (radians).
         is_finite: Whether the kinematics are finite.
         is_rigid: Whether the obstacle is rigid, so that its reactions are external forces.
         follows: Whether pairs are updated with every change of the displacement.
-        updates_pairs: Whether pairs are updated, on the deformed bodies, at every commit and in
-            increments in which bodies slide.
         sampler: Evaluates a rigid obstacle at any position; None if it is known on Γc only, or with
             an opposing body.
     """
@@ -244,11 +238,7 @@ class ContactKinematics(ABC):
         return data, sampled
 
     def laws(self, active: fem.Function) -> tuple[PointLaw, PointLaw]:
-        """Return the law in the form on Γc, and for values at the points.
-
-        Args:
-            active: 1 at the points to which the latter is restricted, 0 at others.
-        """
+        """Return the law in the form on Γc, and for values at ``active`` points (1, others 0)."""
         law, quadrature, jump = self._parts.law, self._parts.quadrature, self.local_jump
         # With finite kinematics derivatives by the motion follow from those by the jump.
         free_shift = {} if self.is_finite else self._parts.inputs.free_shift
@@ -285,11 +275,7 @@ class ContactKinematics(ABC):
 
     @contextmanager
     def displaced(self, by: Array | ObstacleMotion) -> Iterator[None]:
-        """Evaluate points at displaced positions, inside of the block.
-
-        Args:
-            by: Displacement of the points, (n_points, gdim) (length), or a motion of the obstacle.
-        """
+        """Evaluate points displaced by (n_points, gdim) (length) or by a motion, in a block."""
         self._displaced = by if isinstance(by, ObstacleMotion) else ObstacleMotion(by)
         try:
             yield
@@ -297,11 +283,7 @@ class ContactKinematics(ABC):
             self._displaced = None
 
     def displaced_directions(self, vectors: Array) -> Array:
-        """Return directions of point motions rotated to the displaced positions.
-
-        Args:
-            vectors: (..., n_points, gdim).
-        """
+        """Return directions (..., n_points, gdim) of point motions at the displaced positions."""
         return vectors if self._displaced is None else self._displaced.turn.directions(vectors)
 
     def present_jump(self) -> Array:
@@ -333,9 +315,8 @@ class ContactKinematics(ABC):
         body they are found by a separate search, which does not change the pairs.
 
         Returns:
-            Gap, (n_points,) (length): NaN without an opposite point, and infinite where an
-            `Obstacle` defines no distance away from Γc; and unit normals from the body to the
-            obstacle, (n_points, gdim).
+            Gap, (n_points,) (length): NaN without an opposite point, infinite if the obstacle
+            defines no distance away from Γc; and unit normals to the obstacle, (n_points, gdim).
         """
 
     def deviation(self, values: PointValues) -> tuple[Array, Array]:
@@ -370,27 +351,21 @@ class ContactKinematics(ABC):
         return {name: self.turned(vectors, back=True) for name, vectors in framed.items()}
 
     def committed_offset(self, values: PointValues) -> Array:
-        """Return the offset from the points to their committed positions relative to the obstacle.
+        """Return the offset to the committed positions relative to the obstacle (length).
 
-        At the committed ``u`` it is the displacement of a rigid obstacle since the last commit,
-        (n_points, gdim) (length).
+        At the committed ``u`` it is the displacement of a rigid obstacle since the last commit.
         """
         return self.turned(self.committed_jump - values.jump)
 
     def motion_in_increment(self, values: PointValues) -> ObstacleMotion:
-        """Return the motion of a rigid obstacle since the last commit. Collective.
-
-        Args:
-            values: Values of the last evaluation, at the committed ``u``.
-        """
+        """Return the motion of a rigid obstacle from values at the committed ``u``. Collective."""
         turn = self.rotation_in_increment(values)
         return ObstacleMotion(self.committed_offset(values), turn, self.present_jump())
 
     def angle(self, values: PointValues | None = None) -> float:
         """Return the rotation angle of the obstacle from its start (radians). Collective.
 
-        Args:
-            values: Values that determine the angle; by default the data sampled last.
+        By default it is that of the data sampled last.
         """
         inputs = self._parts.inputs
         if inputs.free_angle is not None:
@@ -406,11 +381,7 @@ class ContactKinematics(ABC):
         return self.angle(values) - self.committed_angle
 
     def turning_rate(self) -> Array:
-        """Return the derivative of the obstacle's displacement by its rotation angle. Collective.
-
-        Returns:
-            ω × r at the points, with r from the present axis, (n_points, gdim) (length).
-        """
+        """Return ω × r at the points for a unit rotation, (n_points, gdim) (length). Collective."""
         rotation = self._parts.obstacle.rotation
         assert rotation is not None
         jump = self.present_jump()
@@ -419,12 +390,10 @@ class ContactKinematics(ABC):
         return rotation.rate(data["x"] + jump - data["about"] - data.get("obstacle", 0.0))
 
     def gradient_error(self, values: PointValues) -> Array:
-        """Return the gradient of a rigid obstacle's gap plus the unit normal, its norm. Collective.
+        """Return the norm of the gradient of the gap plus the unit normal, (n_points,). Collective.
 
-        It is evaluated at X with small displacements, at X + u with finite kinematics.
-
-        Returns:
-            (n_points,); 0 for a prescribed gap, and between bodies.
+        It is evaluated at X or, with finite kinematics, X + u; 0 for a given gap and between
+        bodies.
         """
         return np.zeros(len(values.x))
 
@@ -444,8 +413,8 @@ class ContactKinematics(ABC):
     def largest_curvature(self) -> Array | None:
         """Return the largest principal curvature of a rigid obstacle at X + u (1/length).
 
-        It has shape (n_points,). It is 0 if all curvatures are negative, and infinite at a centre
-        of curvature. The result is None with small displacements and between bodies.
+        It has shape (n_points,); 0 if all curvatures are negative, infinite at a centre of
+        curvature. It is None with small displacements and between bodies.
         """
         return None
 
@@ -471,14 +440,10 @@ class ContactKinematics(ABC):
         return np.inf
 
     def largest_slide(self, values: PointValues, of: PointValues | None = None) -> float:
-        """Return the largest slide of points that transmit forces to another body. Collective.
+        """Return the largest slide of points that transmit forces in a state ``of``. Collective.
 
         The slide is the tangential displacement relative to the opposing body since the pairs were
         found, divided by the size of the point's facet. It is 0 where pairs follow the bodies.
-
-        Args:
-            values: Values of the last evaluation.
-            of: State in which the points transmit forces; by default ``values``.
         """
         return 0.0
 
@@ -489,20 +454,14 @@ class ContactKinematics(ABC):
     def needs_new_pairs(self, values: PointValues, of: PointValues | None = None) -> bool:
         """Whether points have slid off their pairs, or could be paired now. Collective.
 
-        It applies to points that transmit forces and slide by more than `slide_limit`, and to
-        unpaired points that have slid as far, if they have an opposite point now. It is False if
-        pairs are fixed or follow the bodies.
-
-        Args:
-            values: Values of the last evaluation.
-            of: State in which the points transmit forces; by default ``values``.
+        It applies to points that transmit forces in a state ``of`` and slide by more than
+        `slide_limit`, and to unpaired points that have slid as far, if they have an opposite point
+        now.
         """
         return False
 
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
         """Find the opposite points; points without one are open. Collective.
-
-        On a rigid obstacle only the points are updated.
 
         Args:
             u: Displacement in which to find them; None for the undeformed bodies.
@@ -532,11 +491,9 @@ class ContactKinematics(ABC):
         return dict(fields)
 
     def commit(self, values: PointValues) -> Array | None:
-        """Make an evaluated state the committed one. Collective.
+        """Make an evaluated state the committed one; return the change of the jump. Collective.
 
-        Returns:
-            Change of the jump by an update of the pairs, (n_points, gdim) (length); None without
-            update.
+        The change by an update of the pairs is (n_points, gdim) (length); None without update.
         """
         self.set_reference(values)
         return None
@@ -549,13 +506,7 @@ class ContactKinematics(ABC):
             self.sampler.committed_shape = self.sampler.shape
 
     def update_committed_jump(self) -> Array:
-        """Evaluate the committed jump between new pairs; ``u`` is the committed displacement.
-
-        Collective.
-
-        Returns:
-            Change of the committed jump, (n_points, gdim) (length).
-        """
+        """Evaluate the committed jump between new pairs; return its change (length). Collective."""
         previous, self.committed_jump = self.committed_jump, self.present_jump()
         return self.committed_jump - previous
 
@@ -566,7 +517,7 @@ class ContactKinematics(ABC):
             depth: Penetration of the points into the opposing body in that run, (n_points,)
                 (length).
             evaluate: Function that returns the present values at the points.
-            new_pairs: Whether that run updated pairs at this commit, see `updates_pairs`.
+            new_pairs: Whether that run updated pairs at this commit.
         """
         self.set_reference(evaluate())
 

@@ -21,9 +21,7 @@ _SLOPE_TOLERANCE = 0.5
 class DeformedPlacement:
     """Gap and normal of a rigid obstacle at X + u instead of X; compiled at the first call.
 
-    Args:
-        displacement: u at the points.
-        placement: Gap and direction as functions of X, with the obstacle's displacement at X + u.
+    The placement is a function of X that has the obstacle's displacement at X + u.
     """
 
     def __init__(
@@ -54,12 +52,8 @@ class DeformedPlacement:
 class VaryingMotion:
     """A prescribed displacement w of an obstacle that varies along Γc.
 
-    It rotates and stretches the surface of the obstacle: a tangent t becomes t + ∇w t, and to first
-    order the normal is along n - ∇wᵀ n, with the surface gradient ∇w. The constructor is
-    collective.
-
-    Attributes:
-        displacement: w at the deformed positions, w + ∇w u (UFL), as of the last `update`.
+    A tangent t becomes t + ∇w t, and to first order the normal is along n - ∇wᵀ n, with the surface
+    gradient ∇w. The constructor is collective. `displacement` is w + ∇w u (UFL).
     """
 
     def __init__(self, quadrature: SurfaceQuadrature) -> None:
@@ -70,16 +64,9 @@ class VaryingMotion:
         self._gradient: Array = np.zeros((quadrature.n_points, d, d))
 
     def update(self, x: Array, shift: Array, normal: Array, displacement: Array) -> None:
-        """Evaluate w at the deformed positions. Collective.
+        """Evaluate w at the deformed positions, from shift w and normal at the points. Collective.
 
-        ∇w is the gradient of the linear function that is the least-squares fit of w at the points
-        of each facet; it is zero on facets with one point.
-
-        Args:
-            x: Positions of the points, (n_points, gdim) (length).
-            shift: w at the points, (n_points, gdim) (length).
-            normal: Normal of the obstacle before its displacement, (n_points, gdim).
-            displacement: u at the points, (n_points, gdim) (length).
+        ∇w is the gradient of the linear least-squares fit of w at the points of each facet.
         """
         offset, change = (v[self._rows] - v[self._rows].mean(axis=1)[:, None] for v in (x, shift))
         mean_normal = normal[self._rows].mean(axis=1)

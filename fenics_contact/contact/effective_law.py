@@ -14,14 +14,12 @@ __all__ = ["EffectiveLaw"]
 class EffectiveLaw:
     """The law of a contact, possibly with a fixed friction bound or restricted to some points.
 
-    The constructor is collective, and compiles the law. Results of the contact always use its own
-    law.
+    The constructor is collective, and compiles the law. Results use the contact's own law.
 
     Attributes:
         own: The law of the contact, evaluated at the points.
         in_form: The law of the contact as expressions on Γc.
-        has_potential: Whether its tractions derive from a potential, so that the tangent is
-            symmetric.
+        has_potential: Whether its tractions derive from a potential (symmetric tangent).
     """
 
     def __init__(self, parts: ContactParts, kinematics: ContactKinematics) -> None:
@@ -55,18 +53,13 @@ class EffectiveLaw:
     def potential(self) -> Array:
         """Return the energy per area at the present ``u``, (n_points,) (stress·length). Collective.
 
-        Raises:
-            ValueError: The law has no potential.
+        Raises a ValueError if the law has no potential.
         """
         self._kinematics.update()
         return self._effective_law.evaluate_potential()
 
     def fix_friction_bound(self, bound: Array) -> None:
-        """Evaluate the law with a given friction bound, unless it has a potential. Collective.
-
-        Args:
-            bound: Friction bound ≥ 0, (n_points,) (stress).
-        """
+        """Use a friction bound (n_points,) (stress), unless the law has a potential. Collective."""
         if self.has_potential:
             return
         if self._fixed_law is None:

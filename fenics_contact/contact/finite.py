@@ -47,7 +47,7 @@ class Frame:
 
     Attributes:
         shift: Displacement of the obstacle; None if it has none.
-        rotation: Rotation matrix and a point of the axis; None if the obstacle does not rotate.
+        rotation: Rotation matrix and a point of the axis; None without rotation.
     """
 
     shift: Any
@@ -87,14 +87,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class DeformedGeometry:
-    """Gap and normal of a rigid obstacle at a deformed position (UFL).
-
-    Attributes:
-        gap: Gap at X + u (length).
-        normal: Unit normal from the body to the obstacle there.
-        convected: Committed fields convected with the obstacle, see `convected_history`; empty
-            without friction.
-    """
+    """Gap (length), normal and `convected_history` of an obstacle at a deformed position (UFL)."""
 
     gap: Any
     normal: Any
@@ -109,7 +102,7 @@ class ExactGeometry:
         x: Coordinates of the undeformed Γc.
         frame: Frame of the obstacle.
         placement_at: Returns gap and direction at coordinates in the frame.
-        convected: Committed fields, see `DeformedGeometry`.
+        convected: The `convected_history`; empty without friction.
     """
 
     x: Any
@@ -128,9 +121,7 @@ def convected_history(
 ) -> dict[str, Any]:
     """Return the committed fields of friction, convected with the obstacle since the commit (UFL).
 
-    Returns:
-        "projection_point", its position minus X (length); "traction" (stress) and "normal", those
-        of the multipliers if there are any.
+    They are "projection_point", minus X (length), "traction" (stress) and "normal".
     """
     projection_point, traction_source = history.ufl("jump"), multipliers or history
     if frame.rotation is not None:
@@ -148,10 +139,6 @@ class SampledGeometry:
     Laws are compiled for values at the points, and serve every obstacle. Gap and normal are linear
     in the displacement, so that the first derivatives of tractions are exact, including the
     curvature of the obstacle. The constructor is collective.
-
-    Args:
-        jump: Displacement of the body at the points.
-        history: The committed state, with vectors in the frame of the obstacle.
     """
 
     def __init__(
@@ -215,9 +202,7 @@ class SampledGeometry:
 class FiniteKinematics:
     """`LocalKinematics` of finite displacements relative to a rigid obstacle.
 
-    Attributes:
-        deformed: Returns gap and normal of the obstacle at displaced points.
-        multipliers: λ_n and λ_t, which replace the committed tractions.
+    ``deformed`` returns gap and normal at a jump; multipliers replace the committed tractions.
     """
 
     deformed: Callable[[Any], DeformedGeometry]
@@ -226,18 +211,17 @@ class FiniteKinematics:
     def __call__(self, jump: Any, law: Law, geometry: PointGeometry) -> PointKinematics:
         """Return the local kinematics at a displacement of the body (UFL)."""
         deformed = self.deformed(jump)
+        gap, n = deformed.gap, deformed.normal
         total = increment = traction = multiplier = None
         if self.multipliers is not None:
             multiplier = self.multipliers.ufl("pressure")
         if law.has_friction:
-            convected, n = deformed.convected, deformed.normal
+            convected = deformed.convected
             total = tangential(geometry.relative(jump), n)
-            slip = jump + deformed.gap * n - convected["projection_point"]
+            slip = jump + gap * n - convected["projection_point"]
             increment = tangential(slip, n)
             traction = _rotate_with_normal(convected["traction"], convected["normal"], n)
-        return PointKinematics(
-            deformed.gap, deformed.normal, total, increment, traction, multiplier
-        )
+        return PointKinematics(gap, n, total, increment, traction, multiplier)
 
 
 def _rotate_with_normal(vector: Any, committed_normal: Any, normal: Any) -> Any:
@@ -252,11 +236,7 @@ def _rotate_with_normal(vector: Any, committed_normal: Any, normal: Any) -> Any:
 
 
 def check_rigid(name: str, shift: Any, rotation: tuple[Any, Any] | None) -> None:
-    """Check that displacement and rotation of an obstacle are uniform.
-
-    Raises:
-        ValueError: One of them varies over Γc or depends on ``u``.
-    """
+    """Check that displacement and rotation are uniform; raise a ValueError if not."""
     varying_terms = (ufl.SpatialCoordinate, ufl.Coefficient)
     if rotation is not None and any(extract_type(ufl.as_ufl(e), varying_terms) for e in rotation):
         raise ValueError(
@@ -271,11 +251,7 @@ def check_rigid(name: str, shift: Any, rotation: tuple[Any, Any] | None) -> None
 
 
 def check_known_everywhere(name: str, placement_at: Callable[[Any], Placement], mesh: Any) -> None:
-    """Check that an obstacle is known at every position, not on the undeformed Γc only.
-
-    Raises:
-        ValueError: It is not.
-    """
+    """Check that an obstacle is known at every position; raise a ValueError if not."""
     if not is_known_everywhere(placement_at, mesh):
         raise ValueError(
             f"{name}: the obstacle is given on the undeformed Γc, but finite kinematics need it at "

@@ -1,18 +1,15 @@
 """Finite sliding between deformable bodies: kinematics at the points of Γc, eq. (3).
 
 A point X of Γc, now at x = X + u, has the opposite point y on its present normal n: x + g n = y
-with the gap g. Integrals are over the undeformed Γc, and the traction T of a point acts on the
-master as -T: the virtual work is -∫ T·(v(X) - v(Y)).
+with the gap g. The traction T of a point, per undeformed area, acts on the master as -T. With the
+displacement w at the last commit, and the normal n₀ and the position y_w of the present opposite
+point at that time, the total slip is
 
-With the displacement w at the last commit, and the normal n₀ and the position y_w of the present
-opposite point at that time, the total slip
+    V = y_w - (X + w(X) + g n₀).
 
-    V = y_w - (X + w(X) + g n₀)
-
-is the distance in the committed bodies from the ray of the point to its present opposite point. It
-needs no history of the pairs and is invariant to rigid-body motions of both bodies together. V and
-the committed traction are rotated by R, the rotation in the polar decomposition of the surface's
-deformation since the commit, from its committed tangents and normal to the present ones.
+It needs no history of the pairs and is invariant to rigid-body motions of both bodies together. V
+and the committed traction are rotated by R, the rotation in the polar decomposition of the
+surface's deformation since the commit (tangents and normal).
 
 All of these are functions of the 2 d² local unknowns q = (u(X), ∂u(X), u(Y), ∂u(Y)) of the point, ∂
 along the surfaces: the tangent is a matrix by q, point by point, between sparse maps to q.
@@ -47,13 +44,7 @@ __all__ = ["FiniteSlidingKinematics", "FiniteSlidingPairs"]
 
 @dataclass(frozen=True)
 class _Committed:
-    """Γc at the committed displacement.
-
-    Attributes:
-        x: Positions of the points, (n_points, d) (length).
-        normal: Unit normals, (n_points, d).
-        along: Dual tangent vectors a^α, (n_points, d, d - 1) (1/length).
-    """
+    """Γc at the committed displacement: positions, normals and dual tangents (1/length)."""
 
     x: Array
     normal: Array
@@ -70,8 +61,7 @@ class _Present:
         gap: Gap along the normal, (n_points,) (length); 0 at unpaired points.
         hits: Intersections of the normals with the opposing surface.
         total_slip: V, (n_points, d) (length).
-        rotation: R, (n_points, d, d).
-        stretch: Stretch Rᵀ F of the surface since the commit, (n_points, d, d).
+        rotation, stretch: R and Rᵀ F of the surface since the commit, (n_points, d, d).
     """
 
     along: Array
@@ -84,9 +74,9 @@ class _Present:
 
 
 class FiniteSlidingPairs(Pairs):
-    """Pairs that follow the bodies: they are found again whenever the displacement changes.
+    """Pairs that follow the bodies: `update` finds them again whenever the displacement changes.
 
-    The constructor is collective, and collects the surfaces; `update` finds the pairs.
+    The constructor is collective, and collects the surfaces.
 
     Attributes:
         local_jump: Independent variables of the laws: "gap" (length), "normal", "slip" R (V -
@@ -112,11 +102,8 @@ class FiniteSlidingPairs(Pairs):
     def update(self, x: Array, normal: Array, history: PointFields, traction: PointFields) -> None:
         """Find the opposite points at the present displacement; update `local_jump`. Collective.
 
-        Args:
-            x: Undeformed positions of the points, (n_points, d).
-            normal: Normals of the undeformed Γc, (n_points, d).
-            history: The committed state.
-            traction: The fields from which the return map starts, history or multipliers.
+        Positions and normals are undeformed; the return map starts from ``traction``, the history
+        or multipliers.
         """
         if self._reference is None:
             assert self.search is not None
@@ -263,24 +250,21 @@ class FiniteSlidingPairs(Pairs):
         bs = space.dofmap.bs
         values = np.repeat(values[:, :, None], d, axis=2)
         columns = all_nodes[:, :, None] * bs + np.arange(d)[None, None, :, None]
-        nonzero = np.abs(values) > ROUND_OFF
-        pointers = np.concatenate([[0], np.cumsum(nonzero.sum(axis=3).ravel())])
+        mask = np.abs(values) > ROUND_OFF
+        pointers = np.concatenate([[0], np.cumsum(mask.sum(axis=3).ravel())])
         n_columns = space.dofmap.index_map.size_local * bs
-        return sparse_matrix(
-            space.mesh.comm, n_columns, pointers, columns[nonzero], values[nonzero]
-        )
+        return sparse_matrix(space.mesh.comm, n_columns, pointers, columns[mask], values[mask])
 
     def tangent(self, by_local_jump: Array, traction: Array, history: PointFields) -> Array:
-        """Return the derivative of the point forces by the local unknowns.
+        """Return the derivative of the point forces by the local unknowns, (n_points, 2 d², 2 d²).
+
+        The rows of u(X) and u(Y) have the variation of the traction, those of ∂u(Y) the motion of
+        the opposite point along its surface.
 
         Args:
             by_local_jump: Derivative of the traction by `local_jump`, (n_points, d, 1 + 3 d).
             traction: Traction on the body, (n_points, d) (stress).
             history: The committed state.
-
-        Returns:
-            (n_points, 2 d², 2 d²): rows of u(X) and u(Y) with the variation of the traction, rows
-            of ∂u(Y) with the motion of the opposite point along its surface.
         """
         assert self._present is not None and self._committed is not None
         present, committed, d = self._present, self._committed, self._gdim
@@ -326,8 +310,7 @@ class FiniteSlidingPairs(Pairs):
     def _rotation_variation(self, normal: Array, slave_slopes: slice) -> Array:
         """Return Rᵀ δR as axial vectors, in the plane as angles, (n_points, 3 or 1, 2 d²).
 
-        In space X U + U X = W - Wᵀ with W = Rᵀ δF and the stretch U; the axial vector of its left
-        side is (tr U - U) x.
+        X U + U X = W - Wᵀ with W = Rᵀ δF and the stretch U has the axial vector (tr U - U) x.
         """
         assert self._present is not None and self._committed is not None
         present, committed, d = self._present, self._committed, self._gdim
@@ -348,11 +331,7 @@ class FiniteSlidingPairs(Pairs):
 
 @dataclass(frozen=True)
 class FiniteSlidingKinematics:
-    """`LocalKinematics` of finite sliding, functions of `FiniteSlidingPairs.local_jump`.
-
-    Attributes:
-        multipliers: λ_n and λ_t, which replace the committed tractions.
-    """
+    """`LocalKinematics` at `FiniteSlidingPairs.local_jump`; multipliers replace tractions."""
 
     multipliers: PointFields | None
 
@@ -379,10 +358,7 @@ def _unit_gram(vectors: Array) -> tuple[Array, Mask]:
 
 
 def _reciprocal(tangents: Array) -> tuple[Array, Mask]:
-    """Return dual vectors a^α with a^α·a_β = δ_αβ, (n, d, d - 1), and where a plane is spanned.
-
-    They are zero where the tangents span no plane.
-    """
+    """Return dual vectors a^α with a^α·a_β = δ_αβ, (n, d, d - 1), and where a plane is spanned."""
     gram, is_plane = _unit_gram(tangents)
     gram[~is_plane] = np.eye(gram.shape[1])
     size = np.linalg.norm(tangents, axis=1, keepdims=True)

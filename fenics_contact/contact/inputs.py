@@ -121,9 +121,7 @@ class Inputs:
         self._name, self._law, self._quadrature = name, law, quadrature
         self._surface, self._accuracy = quadrature.surface, accuracy
         self._gdim = self._surface.mesh.geometry.dim
-        self._stiffness_scale: fem.Function | None = (
-            None  # E/h, if a stiffness is RelativeStiffness
-        )
+        self._modulus_scale: fem.Function | None = None  # E/h of RelativeStiffness
         self._has_modulus = False
         self._opposite = opposite
         self._vertex_areas: VertexAreas | None = None  # if a stiffness is that of NodalSprings
@@ -204,12 +202,12 @@ class Inputs:
                 self._vertex_areas = VertexAreas(self._quadrature, self.weight, self._name)
             return self.to_ufl(name, value.k) / self._vertex_areas.area
         if isinstance(value, RelativeStiffness):
-            if self._stiffness_scale is None:
+            if self._modulus_scale is None:
                 space = fem.functionspace(self._surface.submesh, ("Lagrange", 1))
-                self._stiffness_scale = fem.Function(space)
-                self._stiffness_scale.x.array[:] = 1.0
+                self._modulus_scale = fem.Function(space)
+                self._modulus_scale.x.array[:] = 1.0
             factor = self._accuracy.factor if self._accuracy else DEFAULT_FACTOR
-            return self.to_ufl(name, value.factor or factor) * self._stiffness_scale
+            return self.to_ufl(name, value.factor or factor) * self._modulus_scale
         positive = name in self._law.positive
         if is_number(value):
             is_invalid = not np.isfinite(value) or value < 0 or (positive and value == 0)
@@ -303,7 +301,7 @@ class Inputs:
     @property
     def needs_modulus(self) -> bool:
         """Whether a stiffness is `RelativeStiffness` and `set_modulus` was not called."""
-        return self._stiffness_scale is not None and not self._has_modulus
+        return self._modulus_scale is not None and not self._has_modulus
 
     def set_modulus(self, modulus: Any) -> None:
         """Set Young's modulus E of `RelativeStiffness`. Collective.
@@ -311,7 +309,7 @@ class Inputs:
         Args:
             modulus: A number, or a function with one value per cell (stress).
         """
-        if self._stiffness_scale is None:
+        if self._modulus_scale is None:
             return
         if not isinstance(modulus, fem.Function):
             what = "a positive number, or a fem.Function with one value per cell"
@@ -320,7 +318,7 @@ class Inputs:
             modulus = fem.Function(fem.functionspace(self._surface.mesh, ("DG", 0)))
             modulus.x.array[:] = value
         scale = modulus_over_height(self._surface, modulus, self._opposite)
-        self._stiffness_scale.x.array[:] = scale.x.array
+        self._modulus_scale.x.array[:] = scale.x.array
         self._has_modulus = True
 
     def update(self) -> None:
@@ -389,8 +387,7 @@ class Inputs:
     def check_side(self, values: PointValues, *, gap_prescribed: bool) -> None:
         """Reject or warn of a normal that points into the body on all of Γc. Collective.
 
-        Raises:
-            ValueError: The body is also deep inside the obstacle.
+        A ValueError is raised if the body is also deep inside the obstacle.
         """
         comm = self._surface.mesh.comm
         if global_max(comm, values.facing) > -FLAT:  # NaN is reported elsewhere
@@ -437,11 +434,8 @@ def check_data(
 ) -> None:
     """Check that data have values at the points of Γc that are constant within an increment.
 
-    The law is evaluated with these values, so that data cannot depend on the unknown
-    ``displacement``.
-
-    Raises:
-        ValueError: Data have no such values.
+    The law is evaluated with these values, so that data cannot depend on the unknown. If they do,
+    or have no values there, a ValueError is raised.
     """
     unknowns = displacement.whole.x.array, displacement.u.x.array
     for what, expression in given.items():

@@ -45,12 +45,9 @@ _TRACTION_ROUND_OFF = 16 * np.finfo(float).eps
 class TraceProjection:
     """L² projection of values at the quadrature points onto continuous functions on Γc.
 
-    The norm is that of the quadrature. If the points do not determine the function, it is one of
-    the closest ones, which have equal values at the points. The constructor is collective.
-
-    Args:
-        degree: Degree of the displacement element; that of the functions is one less, and at least
-            1.
+    The norm is that of the quadrature; the degree is one less than that of the displacement, and at
+    least 1. If the points do not determine the function, it is one of the closest ones, which have
+    equal values at the points. The constructor is collective.
     """
 
     def __init__(self, quadrature: SurfaceQuadrature, degree: int) -> None:
@@ -124,11 +121,7 @@ class Multipliers:
         return projected
 
     def tangential_change(self, values: PointValues) -> Array:
-        """Return the change of λ_t by an augmentation, without excluded part. Collective.
-
-        Returns:
-            In the frame of the obstacle, (n_points, gdim) (stress).
-        """
+        """Return the change of λ_t by an augmentation, in the obstacle's frame. Collective."""
         self._excluded_part = None
         return np.asarray(self._projected(values)["traction"] - self.fields.values("traction"))
 
@@ -178,11 +171,7 @@ class Multipliers:
         self.fields.assign(values | {"pressure": factor * values["pressure"]})
 
     def drop(self, unloaded: Mask) -> None:
-        """Set the multipliers of unloaded connected parts of Γc to zero. Collective.
-
-        Args:
-            unloaded: Mask of the points without contact force, (n_points,).
-        """
+        """Set the multipliers of unloaded connected parts of Γc to zero. Collective."""
         is_loaded = self._largest(np.where(unloaded, 0.0, 1.0))[self._patch] > 0.0
         self.fields.set_rows(np.where(is_loaded[:, None], self.fields.rows(), 0.0))
 
@@ -197,25 +186,13 @@ class Multipliers:
         return np.stack([np.column_stack(present), np.column_stack(list(projected.values()))])
 
     def take(self, rows: Array, values: PointValues) -> None:
-        """Set the multipliers at an evaluated state. Collective.
-
-        Args:
-            rows: λ_n and, with friction, λ_t, (n_points, 1 + gdim) (stress).
-            values: The evaluated state.
-        """
+        """Set λ_n and, with friction, λ_t, (n_points, 1 + gdim) (stress). Collective."""
         self.fields.assign(
             {"pressure": rows[:, 0], "traction": rows[:, 1:], "normal": values.framed_normal}
         )
 
     def sizes(self, rows: Array) -> Array:
-        """Return the largest absolute value on the connected part of each point. Collective.
-
-        Args:
-            rows: (n_points, n).
-
-        Returns:
-            Array (n_points,).
-        """
+        """Return the largest absolute value on the connected part of each point. Collective."""
         return self._largest(rows)[self._patch]
 
     def committed(self, values: PointValues) -> dict[str, Array]:
@@ -228,10 +205,8 @@ class Multipliers:
         if self._law.has_friction:
             fields |= {name: self.fields.values(name) for name in self._vectors}
             fields["jump"] = values.projection_point - values.elastic_slip
-        tractions = [
-            values.arrays[n] for n in ("normal_traction", "traction") if n in values.arrays
-        ]
-        if not any(global_max(self._comm, np.abs(part)) > 0.0 for part in tractions):
+        parts = [values.arrays[n] for n in ("normal_traction", "traction") if n in values.arrays]
+        if not any(global_max(self._comm, np.abs(part)) > 0.0 for part in parts):
             # Round-off in the multipliers would close points at the next touch.
             zeros = {"multiplier", "traction"} & set(fields)
             fields |= {name: np.zeros_like(fields[name]) for name in zeros}

@@ -31,8 +31,7 @@ class ObstacleSampler:
 
     Args:
         quadrature: The points of Γc, whose function space the compiled form uses.
-        obstacle: Gap and direction at a position in the obstacle's frame (UFL), or a
-            `SampledObstacle`.
+        obstacle: Gap and direction at a position in its frame (UFL), or a `SampledObstacle`.
     """
 
     def __init__(
@@ -81,15 +80,12 @@ class ObstacleSampler:
             first = last
 
     def sample(self, position: Array, time: Array | float = 1.0) -> tuple[Array, Array]:
-        """Return signed distances, and unit normals from the body to the obstacle. Collective.
+        """Return signed distances, (n,) (length), and unit normals to the obstacle. Collective.
 
         Args:
             position: Positions in the obstacle's frame, (n, gdim) (length); n may differ between
                 ranks.
             time: From 0, the committed shape, to 1, the present one, one value or (n,).
-
-        Returns:
-            (n,) (length) and (n, gdim).
         """
         if isinstance(self._obstacle, SampledObstacle):
             with collective_errors(self._comm):
@@ -99,11 +95,7 @@ class ObstacleSampler:
         return distance, normal
 
     def gradient_error(self, position: Array) -> Array:
-        """Return the gradient of the distance plus the normal, its norm, (n,). Collective.
-
-        Args:
-            position: Positions in the obstacle's frame, (n, gdim) (length).
-        """
+        """Return the norm of the gradient of the distance plus the normal, (n,). Collective."""
         if isinstance(self._obstacle, SampledObstacle):
             with collective_errors(self._comm):
                 sample = self._obstacle.sample_checked(position)
@@ -144,11 +136,6 @@ def _gradient(obstacle: SampledObstacle, x: Array, sample: Sample) -> Array:
     Towards the closest point of the surface the slope of a distance is -1, and sideways it is 0 on
     one side at least, at edges too. The gradient is minus the normal where the step would be below
     the round-off of the coordinates.
-
-    Args:
-        obstacle: The obstacle.
-        x: Positions, (n, gdim) (length).
-        sample: The sample of the obstacle there.
     """
     length = np.linalg.norm(sample.normal, axis=1, keepdims=True)
     unit = sample.normal / np.where(length > 0, length, np.nan)

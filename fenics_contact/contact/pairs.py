@@ -36,25 +36,22 @@ class PairsState:
 class Pairs:
     """Opposite points, and the sparse map from the dofs to the jump at the quadrature points.
 
-    On a rigid obstacle every point is paired. The constructor is collective, and collects the
-    surfaces; `find` finds the pairs.
+    On a rigid obstacle every point is paired, and there is no opposite map, distance, indicator or
+    search. The constructor is collective, and collects the surfaces; `find` finds the pairs.
 
     Attributes:
         own_map: Map from ``u`` to the displacement of the points, (n_points gdim, n_dofs).
         jump_map: Map from ``u`` to the jump, of the same shape; it depends on the pairs.
         opposite_map: Map to the displacement of the points that the normals meet, not projected;
-            None on a rigid obstacle, and if pairs follow the bodies.
+            None if pairs follow the bodies.
         paired: Mask of this rank's points that have an opposite point, (n_points,).
         n_unpaired: Number of points without an opposite point, on all ranks.
         number: Number of updates of the pairs.
-        distance: Distance to the opposite point, a function at the points; None on a rigid
-            obstacle.
-        indicator: 1 at paired points, 0 at others, a function at the points; None on a rigid
-            obstacle.
-        search: Search of the opposing surface; None on a rigid obstacle.
-        found_at: Displacement in which the pairs were found; None for the undeformed bodies.
-        pairing_jump: The jump in that displacement, (n_points, gdim) (length); None for the
-            undeformed bodies
+        distance: Distance to the opposite point, a function at the points.
+        indicator: 1 at paired points, 0 at others, a function at the points.
+        search: Search of the opposing surface.
+        found_at, pairing_jump: Displacement in which the pairs were found, and its jump, (n_points,
+            gdim) (length); None for the undeformed bodies.
         degenerate: Whether Γc has no tangent plane at a point of any rank, in a diverged trial
             state of pairs that follow the bodies.
     """
@@ -82,13 +79,10 @@ class Pairs:
             self.indicator = fem.Function(quadrature.space(), name="paired")
 
     def find(self, x: Array, normal: Array, depth: Array, u: fem.Function | None) -> None:
-        """Find the opposite points; points without one are open. Collective.
+        """Find the opposite points in ``u``, or None; points without one are open. Collective.
 
-        Args:
-            x: Undeformed positions of the points, (n_points, gdim).
-            normal: Normals of the undeformed Γc, (n_points, gdim).
-            depth: Penetration of the points into the opposing body in ``u``, (n_points,) (length).
-            u: Displacement in which to find them; None for the undeformed bodies.
+        Positions x and normals are those of the undeformed Γc, (n_points, gdim); the depth is that
+        of the points in the opposing body in ``u``, (n_points,) (length).
         """
         assert self.search and self.distance and self.indicator
         opposite, self.opposite_map, distance, reasons = self.search.pair(x, normal, u, depth)
@@ -167,12 +161,9 @@ class Pairs:
         return np.where(self.paired, np.maximum(depth, 0.0), 0.0)
 
     def displacement_since_pairing(self) -> Array:
-        """Return the displacement relative to the opposing surface since the pairs were found.
+        """Return the displacement since pairing relative to the mean of the opposing surface.
 
-        The displacement of the surface is the mean over its nodes. Collective.
-
-        Returns:
-            (n_points, gdim) (length).
+        It has shape (n_points, gdim) (length). Collective.
         """
         assert self.search is not None
         change = self._u.copy()
@@ -201,15 +192,9 @@ class Pairs:
         return self.search.true_gap(values.x, self._u, depth)
 
     def linear_gap(self, normal: Array) -> Array:
-        """Return the linearised gap with the opposite displacement not projected. Collective.
+        """Return the linearised gap with the opposite displacement not projected, (n_points,).
 
-        It is comparable with `true_gap`, which is not projected either.
-
-        Args:
-            normal: Unit normals of the undeformed Γc, (n_points, gdim).
-
-        Returns:
-            (n_points,) (length); undefined at unpaired points.
+        It is comparable with `true_gap`, and undefined at unpaired points. Collective.
         """
         assert self.distance and self.opposite_map
         jump = self.own_displacement() - self._product(self.opposite_map, self._u)

@@ -44,12 +44,7 @@ LocalKinematics: TypeAlias = Callable[[Any, Law, PointGeometry], PointKinematics
 
 @dataclass(frozen=True)
 class SmallKinematics:
-    """`LocalKinematics` of small displacements, with the undeformed normals and gap.
-
-    Attributes:
-        history: The committed state.
-        multipliers: λ_n and λ_t, which replace the committed tractions.
-    """
+    """`LocalKinematics` of small displacements; multipliers replace the committed tractions."""
 
     history: PointFields
     multipliers: PointFields | None

@@ -35,11 +35,10 @@ class PointTangent:
     Attributes:
         by_jump: By the jump, (n_points, gdim, gdim) (stress/length); of the point forces by the
             local unknowns if `Pairs.local_map` is not None.
-        by_shift: By the displacement of the obstacle, of the same shape; None if no component is
-            free.
+        by_shift: By the displacement of the obstacle; None if no component is free.
         spun: By a common rotation of body and obstacle, ω × the traction, (n_points, gdim)
-            (stress); None if no moment rotates the obstacle. It neglects the fixed direction of
-            anisotropic friction.
+            (stress), without the fixed direction of anisotropic friction; None if no moment rotates
+            the obstacle.
     """
 
     by_jump: Array
@@ -178,10 +177,9 @@ class PointLaw:
         return PointEvaluator(self._quadrature, columns)
 
     def evaluate_yield(self) -> tuple[Array, Array]:
-        """Evaluate the law's yield functions and their gradients. Collective.
+        """Evaluate the yield functions and their gradients by the traction. Collective.
 
-        Returns:
-            g_j(τ, bound) (stress), (n_points, n_modes), and ∂g_j/∂τ, (n_points, n_modes, gdim).
+        They are (n_points, n_modes) (stress) and (n_points, n_modes, gdim).
         """
         samples = self._yield()
         gradients = [samples[name] for name in samples if name != "functions"]
@@ -315,25 +313,20 @@ class PointLaw:
         return PointEvaluator(self._quadrature, expressions, by_points=True)
 
     def _check_terminals(self, expression: Any) -> None:
-        """Check that a law depends on its kinematics and parameters only.
+        """Check that a law depends on its kinematics and parameters only; raise a ValueError.
 
         Other functions and constants are neither checked nor stored in checkpoints.
-
-        Raises:
-            ValueError: The law uses another function, constant or coordinate.
         """
         submesh = self._quadrature.surface.submesh
         for item in traverse_unique_terminals(ufl.as_ufl(expression)):
-            is_local = True
+            local = True
             if isinstance(item, fem.Constant):
-                is_local = item is self._closure
+                local = item is self._closure
             elif isinstance(item, fem.Function):
-                is_local = (
-                    item.function_space.mesh is submesh or item.function_space.mesh == submesh
-                )
+                local = item.function_space.mesh is submesh or item.function_space.mesh == submesh
             elif isinstance(item, ufl.classes.GeometricQuantity):
-                is_local = extract_unique_domain(item) == submesh.ufl_domain()
-            if not is_local:
+                local = extract_unique_domain(item) == submesh.ufl_domain()
+            if not local:
                 what = getattr(item, "name", None) or f"a {type(item).__name__}"
                 raise ValueError(
                     f"{type(self.law).__name__} uses {what} in contact_traction or another method; "

@@ -64,7 +64,7 @@ class RigidSmall(ContactKinematics):
         self._gradient_error: PointEvaluator | None = None
         if self.sampler is None and parts.gap is None and _depends_on_position(parts):
             position = ufl.variable(frame.into(x))
-            placement = _placement_in_frame(parts, position)
+            placement = _in_frame(parts, position)
             error = ufl.diff(placement.gap, position) + placement.normal
             self._gradient_error = PointEvaluator(parts.quadrature, {"error": error})
 
@@ -114,7 +114,7 @@ class RigidFinite(ContactKinematics):
         check_rigid(parts.name, inputs.shift, inputs.rotation)
 
         def placement_at(z: Any) -> Placement:
-            return _placement_in_frame(parts, z)
+            return _in_frame(parts, z)
 
         x = ufl.SpatialCoordinate(mesh)
         if undeformed is None:
@@ -199,14 +199,14 @@ class RigidFinite(ContactKinematics):
         return {"jump": self.committed_jump + gap[:, None] * normal, "normal": normal}
 
 
-def _placement_in_frame(parts: ContactParts, z: Any) -> Placement:
+def _in_frame(parts: ContactParts, z: Any) -> Placement:
     """Return gap and direction of a rigid obstacle at a position in its frame (UFL)."""
     return parts.obstacle.placed(z, lambda v: parts.inputs.to_ufl("obstacle", v))
 
 
 def _displaced_placement(parts: ContactParts, x: Any, frame: Frame) -> Placement:
     """Return gap and direction of a displaced rigid obstacle at the position x (UFL)."""
-    placement = _placement_in_frame(parts, frame.into(x))
+    placement = _in_frame(parts, frame.into(x))
     if frame.shift is None or _depends_on_position(parts):
         return placement
     # A gap that is given on Γc is that of the obstacle in its initial position.
@@ -215,9 +215,7 @@ def _displaced_placement(parts: ContactParts, x: Any, frame: Frame) -> Placement
 
 def _depends_on_position(parts: ContactParts) -> bool:
     """Whether the gap is a function of the position, rather than a field on Γc."""
-    return depends_on_position(
-        lambda z: _placement_in_frame(parts, z), parts.quadrature.surface.mesh
-    )
+    return depends_on_position(lambda z: _in_frame(parts, z), parts.quadrature.surface.mesh)
 
 
 def _sampler(parts: ContactParts) -> ObstacleSampler | None:
@@ -226,11 +224,9 @@ def _sampler(parts: ContactParts) -> ObstacleSampler | None:
     if isinstance(obstacle, SampledObstacle):
         return ObstacleSampler(parts.quadrature, obstacle)
     mesh = parts.quadrature.surface.mesh
-    if parts.gap is not None or not is_known_everywhere(
-        lambda z: _placement_in_frame(parts, z), mesh
-    ):
+    if parts.gap is not None or not is_known_everywhere(lambda z: _in_frame(parts, z), mesh):
         return None
-    return ObstacleSampler(parts.quadrature, lambda z: _placement_in_frame(parts, z))
+    return ObstacleSampler(parts.quadrature, lambda z: _in_frame(parts, z))
 
 
 def _sample_placements(
@@ -238,8 +234,7 @@ def _sample_placements(
 ) -> tuple[SampledPlacement | None, SampledPlacement | None]:
     """Return samples of a `SampledObstacle` at X and at X + u, otherwise None. Collective.
 
-    Raises:
-        ValueError: Its data have another dimension, or differ between ranks.
+    Raises a ValueError if its data have another dimension, or differ between ranks.
     """
     obstacle, mesh = parts.obstacle, parts.quadrature.surface.mesh
     if not isinstance(obstacle, SampledObstacle):

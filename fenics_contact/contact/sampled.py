@@ -21,10 +21,7 @@ class SampledPlacement:
 
     Gap, normal and their first derivatives are exact there, so that a solution with the expansion
     is one for the obstacle itself, provided that `update` is called after every change of the
-    positions. The constructor is collective; `update` samples.
-
-    Args:
-        position: Positions of the points in the frame of the obstacle, (gdim,) (UFL, length).
+    position, a UFL vector in the frame of the obstacle (length). The constructor is collective.
     """
 
     def __init__(
@@ -43,8 +40,7 @@ class SampledPlacement:
         """Sample at the present positions of the points. Collective.
 
         Raises:
-            ValueError: The samples are invalid, see `SampledObstacle.sample_checked`; raised on all
-                ranks, as are errors of the obstacle itself.
+            ValueError: The samples are invalid; raised on all ranks, as are errors of the obstacle.
         """
         position = self._evaluate()["position"]
         # Diverged iterates are not sampled.
@@ -69,12 +65,8 @@ class SampledPlacement:
         """Return gap and direction at a position near the sampled one (UFL)."""
         field = self._fields.ufl
         offset = position - field("position")
-        normal_change = ufl.as_vector(
+        bend = ufl.as_vector(
             [ufl.dot(field(f"curvature {i}"), offset) for i in range(self._obstacle.gdim)]
         )
-        gap = (
-            field("distance")
-            - ufl.dot(field("normal"), offset)
-            + ufl.dot(offset, normal_change) / 2
-        )
-        return Placement(gap, field("normal") - normal_change)
+        gap = field("distance") - ufl.dot(field("normal"), offset) + ufl.dot(offset, bend) / 2
+        return Placement(gap, field("normal") - bend)

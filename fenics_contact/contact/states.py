@@ -121,11 +121,7 @@ class ContactStates:
         self.set_state(ContactState(self.history.rows(), self._kinematics.state()))
 
     def begin_between(self, kinematics: KinematicsState) -> None:
-        """Start the increment from other pairs; `restore` undoes it. Collective.
-
-        Args:
-            kinematics: The pairs, with the committed jump between them.
-        """
+        """Start the increment with other pairs and their committed jump. Collective."""
         jump_change = kinematics.jump - self._kinematics.committed_jump
         self._kinematics.set_state(kinematics)
         if self._law.has_friction:
@@ -134,12 +130,9 @@ class ContactStates:
         self.forget()
 
     def set_slip_reference(self, points: Mask) -> None:
-        """Measure slip from the state evaluated last at unloaded points. Collective.
+        """Measure slip from the state evaluated last at unloaded points of a mask. Collective.
 
         `restore` undoes it. Points that were loaded at the last commit keep their reference.
-
-        Args:
-            points: Mask of the points, (n_points,).
         """
         if not self._law.has_friction:
             return
