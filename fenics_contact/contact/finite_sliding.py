@@ -107,9 +107,9 @@ class FiniteSlidingPairs(Pairs):
         """
         if self._reference is None:
             assert self.search is not None
-            place = self.search.located(x)
-            self._reference = place, normal
-            hits, depth = self.search.at_rest(place, x, normal)
+            xi = self.search.located(x)
+            self._reference = xi, normal
+            hits, depth = self.search.at_rest(xi, x, normal)
             self._undeformed = np.nan_to_num(hits.distance), depth
         changed = self._last_u is None or not np.array_equal(self._last_u, self._u.x.array)
         if self._mesh.comm.allreduce(int(changed)) or self._present is None:
@@ -121,13 +121,13 @@ class FiniteSlidingPairs(Pairs):
         """Find the opposite points at the present displacement. Collective."""
         assert self._reference is not None and self._undeformed is not None
         assert self.search is not None and self.indicator is not None
-        side, facet, (place, undeformed) = self._rays.here.facets, self._rays.facet, self._reference
+        side, facet, (xi, undeformed) = self._rays.here.facets, self._rays.facet, self._reference
         if self._committed is None:
-            x, tangents = side.positions(facet, place, self._committed_u)
+            x, tangents = side.positions(facet, xi, self._committed_u)
             normal = side.outward_normals(facet, tangents)
             self._committed = _Committed(x, normal, _reciprocal(tangents)[0])
         committed = self._committed
-        _, tangents = side.positions(facet, place, self._u)
+        _, tangents = side.positions(facet, xi, self._u)
         along, is_plane = _reciprocal(tangents)
         self.degenerate = bool(self._mesh.comm.allreduce(int(not is_plane.all())))
         normal = side.outward_normals(facet, tangents)
@@ -135,7 +135,7 @@ class FiniteSlidingPairs(Pairs):
         if not global_max(self._mesh.comm, np.abs(self._committed_u.x.array)) > 0:
             depth = np.maximum(depth, self._undeformed[1])
         hits = self._rays.follow(
-            facet, place, normal, self._u, depth, undeformed=undeformed, before=self._committed_u
+            facet, xi, normal, self._u, depth, undeformed=undeformed, before=self._committed_u
         )
         paired = hits.facet >= 0
         # Of bodies in contact without pressure, round-off would close half of the points.
@@ -237,10 +237,10 @@ class FiniteSlidingPairs(Pairs):
 
     def _make_local_map(self) -> PETSc.Mat:
         assert self._reference is not None and self._present is not None
-        slave, facet, place = self._rays.here.facets, self._rays.facet, self._reference[0]
-        space, d, n = self._u.function_space, self._gdim, len(place)
+        slave, facet, xi = self._rays.here.facets, self._rays.facet, self._reference[0]
+        space, d, n = self._u.function_space, self._gdim, len(xi)
         partner = self._present.hits.partner
-        nodes, weights = slave.interpolation(facet, place)
+        nodes, weights = slave.interpolation(facet, xi)
         # (n, 2 d) functionals of each component: value and slopes of the slave, then the master.
         values = np.concatenate([weights, partner.weights], axis=1)
         all_nodes = np.concatenate(

@@ -422,8 +422,8 @@ def is_varying(value: Any) -> bool:
     """Whether a number or UFL expression may vary in space."""
     if not isinstance(value, ufl.core.expr.Expr):
         return False
-    places = (ufl.classes.Coefficient, ufl.classes.GeometricQuantity)
-    return any(isinstance(item, places) for item in traverse_unique_terminals(value))
+    spatial = (ufl.classes.Coefficient, ufl.classes.GeometricQuantity)
+    return any(isinstance(item, spatial) for item in traverse_unique_terminals(value))
 
 
 def check_data(

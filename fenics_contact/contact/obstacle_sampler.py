@@ -134,7 +134,7 @@ def _gradient(obstacle: SampledObstacle, x: Array, sample: Sample) -> Array:
     """Return the gradient of a sampled distance by difference quotients, (n, gdim).
 
     Towards the closest point of the surface the slope of a distance is -1, and sideways it is 0 on
-    one side at least, at edges too. The gradient is minus the normal where the step would be below
+    at least one side, even at edges. The gradient is minus the normal where the step would be below
     the round-off of the coordinates.
     """
     length = np.linalg.norm(sample.normal, axis=1, keepdims=True)

@@ -319,14 +319,14 @@ class PointLaw:
         """
         submesh = self._quadrature.surface.submesh
         for item in traverse_unique_terminals(ufl.as_ufl(expression)):
-            local = True
+            valid = True
             if isinstance(item, fem.Constant):
-                local = item is self._closure
+                valid = item is self._closure
             elif isinstance(item, fem.Function):
-                local = item.function_space.mesh is submesh or item.function_space.mesh == submesh
+                valid = item.function_space.mesh is submesh or item.function_space.mesh == submesh
             elif isinstance(item, ufl.classes.GeometricQuantity):
-                local = extract_unique_domain(item) == submesh.ufl_domain()
-            if not local:
+                valid = extract_unique_domain(item) == submesh.ufl_domain()
+            if not valid:
                 what = getattr(item, "name", None) or f"a {type(item).__name__}"
                 raise ValueError(
                     f"{type(self.law).__name__} uses {what} in contact_traction or another method; "

@@ -65,8 +65,8 @@ class SampledPlacement:
         """Return gap and direction at a position near the sampled one (UFL)."""
         field = self._fields.ufl
         offset = position - field("position")
-        bend = ufl.as_vector(
+        change = ufl.as_vector(
             [ufl.dot(field(f"curvature {i}"), offset) for i in range(self._obstacle.gdim)]
         )
-        gap = field("distance") - ufl.dot(field("normal"), offset) + ufl.dot(offset, bend) / 2
-        return Placement(gap, field("normal") - bend)
+        gap = field("distance") - ufl.dot(field("normal"), offset) + ufl.dot(offset, change) / 2
+        return Placement(gap, field("normal") - change)
