@@ -45,8 +45,8 @@ class FreeMotion:
         way: "along x", or "about its axis".
         constant: The unknown: a displacement (length) or an angle.
         load: Returns the given force or moment.
-        length: Scale of an angle, which times it is the unknown; the moment by it is the force. It
-            is 1 for displacements, and a power of two, to avoid round-off.
+        length: Factor from an angle to the unknown, and divisor from the moment to its force: 1 for
+            displacements, a power of two for angles, to avoid round-off.
         turns: Whether the unknown is an angle.
     """
 

@@ -5,7 +5,7 @@ every solution the multipliers are set to the tractions (Uzawa): an augmentation
 penetration to about 1/(1 + k_n/k) with the stiffness k of the body, and is accelerated
 (`methods/acceleration.py`).
 
-Multipliers at every quadrature point would be overconstrained: an edge of quadratic cells has 3
+Multipliers at every quadrature point would be too rich a space: an edge of quadratic cells has 3
 points, but 2 nodes of its own. Therefore λ is the L² projection Π of the tractions onto continuous
 functions of one degree less than the displacement (at least 1). The solution is a stationary point
 of the augmented Lagrangian in this space, with Π(u_n - s) = 0 in closed zones; the part of the
@@ -109,7 +109,7 @@ class Multipliers:
         self._first: Array = np.full((2, self._n_patches), np.nan)
         self._excluded_part: Array | None = None  # from the next change of λ_t
 
-    def _projected(self, values: PointValues) -> dict[str, Array]:
+    def _next_multipliers(self, values: PointValues) -> dict[str, Array]:
         """Return the projected tractions of an evaluated state, the next multipliers."""
         projected: dict[str, Array] = {"pressure": np.zeros(len(values.normal_traction))}
         if self._law.has_normal_stiffness:
@@ -123,7 +123,9 @@ class Multipliers:
     def tangential_change(self, values: PointValues) -> Array:
         """Return the change of λ_t by an augmentation, in the obstacle's frame. Collective."""
         self._excluded_part = None
-        return np.asarray(self._projected(values)["traction"] - self.fields.values("traction"))
+        return np.asarray(
+            self._next_multipliers(values)["traction"] - self.fields.values("traction")
+        )
 
     def leave_out(self, part: Array) -> None:
         """Exclude a part from the next change of λ_t, until `tangential_change` or `restore`."""
@@ -131,7 +133,7 @@ class Multipliers:
 
     def error(self, values: PointValues, history: PointFields, moved: Array) -> float:
         """Return `Contact.enforcement_error` of an evaluated state. Collective."""
-        projected = self._projected(values)
+        projected = self._next_multipliers(values)
         names = [n for n in ("normal_traction", "traction") if n in history]
 
         def largest(rows: Iterable[Array]) -> Array:
@@ -181,7 +183,7 @@ class Multipliers:
         Returns:
             Array (2, n_points, 1 or 1 + gdim) (stress): λ_n and, with friction, λ_t.
         """
-        projected = self._projected(values)
+        projected = self._next_multipliers(values)
         present = [self.fields.values(name) for name in projected]
         return np.stack([np.column_stack(present), np.column_stack(list(projected.values()))])
 
