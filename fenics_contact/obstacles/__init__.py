@@ -1,1 +1,1 @@
-"""What the body presses on: rigid shapes, obstacles, another body."""
+"""Obstacles: rigid bodies and opposing deformable bodies."""

@@ -1,1 +1,1 @@
-"""Γc: its facets, points and fields, and what lies opposite."""
+"""The contact surface Γc: facets, quadrature, history fields and contact search."""

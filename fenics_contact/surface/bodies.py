@@ -1,4 +1,4 @@
-"""Bodies of a mesh: the parts of it that its displacements connect."""
+"""Bodies of a mesh: the connected components of its graph of nodes."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ __all__ = ["connected_bodies"]
 
 
 def connected_bodies(space: fem.FunctionSpace) -> tuple[int, npt.NDArray[np.intp]]:
-    """Number of bodies, and the body of every node of this rank, its ghosts last. Collective.
+    """Number the bodies of a mesh by the nodes that its cells connect. Collective.
 
     Returns:
-        The number over all ranks, and the numbers from 0, (n_owned + n_ghosts,): the same body has
-        the same number on every rank, and on any number of ranks: by their places, x first.
+        Number of bodies on all ranks, and the body of every node of this rank, ghosts last,
+        (n_owned + n_ghosts,). The numbering, by position, does not depend on the partition.
     """
     comm, dofmap = space.mesh.comm, space.dofmap
     n_owned = dofmap.index_map.size_local
@@ -28,32 +28,32 @@ def connected_bodies(space: fem.FunctionSpace) -> tuple[int, npt.NDArray[np.intp
     links = scipy.sparse.coo_matrix(
         (np.ones(first.size, dtype=np.int8), (first, cells[:, 1:].ravel())), (n_nodes, n_nodes)
     )
-    # Nodes that no cell here has, all of them ghosts, are parts of their own.
-    n_parts, part = scipy.sparse.csgraph.connected_components(links, directed=False)
-    offset = comm.scan(n_parts) - n_parts
-    # A ghost belongs to a part here and to one on its owner: the two are one body.
+    # Ghost nodes without a cell on this rank are components of their own.
+    n_components, component = scipy.sparse.csgraph.connected_components(links, directed=False)
+    offset = comm.scan(n_components) - n_components
+    # The component of a ghost on this rank and that on its owner are one body.
     label = fem.Function(space)
-    label.x.array.reshape(n_nodes, dofmap.bs)[:, 0] = offset + part
+    label.x.array.reshape(n_nodes, dofmap.bs)[:, 0] = offset + component
     label.x.scatter_forward()
     owner = label.x.array.reshape(n_nodes, dofmap.bs)[n_owned:, 0].astype(np.int64)
-    pairs = np.unique(np.column_stack([owner, offset + part[n_owned:]]), axis=0)
+    pairs = np.unique(np.column_stack([owner, offset + component[n_owned:]]), axis=0)
     pairs = np.concatenate(comm.allgather(pairs))
-    total = comm.allreduce(n_parts)
+    total = comm.allreduce(n_components)
     graph = scipy.sparse.coo_matrix((np.ones(len(pairs)), pairs.T), (total, total))
     _, merged = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    # Numbered by the parts that own nodes: every body has one.
+    # Only components with owned nodes are numbered: every body has one.
     used = np.zeros(total, dtype=np.int64)
-    np.add.at(used, offset + part[:n_owned], 1)
+    np.add.at(used, offset + component[:n_owned], 1)
     comm.Allreduce(MPI.IN_PLACE, used, op=MPI.SUM)
     bodies = np.unique(merged[used > 0])
-    body = np.searchsorted(bodies, merged[offset + part])
+    body = np.searchsorted(bodies, merged[offset + component])
     if len(bodies) > 1:
-        body = _ordered(space, len(bodies), body)
+        body = _renumber(space, len(bodies), body)
     return len(bodies), body
 
 
-def _ordered(space: fem.FunctionSpace, n: int, body: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Numbers by the corners of the bodies' boxes, the lower ones first. Collective."""
+def _renumber(space: fem.FunctionSpace, n: int, body: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
+    """Number bodies in the order of their bounding boxes, lowest first. Collective."""
     x = space.tabulate_dof_coordinates()
     corners = np.full((2, n, x.shape[1]), np.inf)
     for corner, sign in zip(corners, (1.0, -1.0), strict=True):
