@@ -1,4 +1,4 @@
-"""What a form depends on."""
+"""Detection of changed constants and coefficients of a form."""
 
 from __future__ import annotations
 
@@ -13,37 +13,37 @@ __all__ = ["Dependence"]
 
 
 class Dependence:
-    """Whether any of the numbers that a form depends on was changed since they were last noted.
+    """Constants and coefficients of a form, compared with their last recorded values.
 
     Args:
         constants: Constants of the form.
-        coefficients: Coefficients of the form, without those that may change as they will.
+        coefficients: Coefficients of the form whose changes matter.
     """
 
     def __init__(
         self, constants: Sequence[fem.Constant], coefficients: Sequence[fem.Function]
     ) -> None:
-        # Views stay valid as long as what they are of.
+        # The views are valid as long as their owners exist.
         self._owners = (tuple(constants), tuple(coefficients))
         self._views = [np.ravel(c.value) for c in constants] + [f.x.array for f in coefficients]
-        self._noted: Array | None = None
+        self._recorded: Array | None = None
 
     @property
     def changed(self) -> bool:
-        """Whether a number is another one than noted, on this rank; True if none was noted."""
-        return self._noted is None or not np.array_equal(self._numbers(), self._noted)
+        """Whether a value on this rank differs from the record; True without a record."""
+        return self._recorded is None or not np.array_equal(self._values(), self._recorded)
 
     def has(self, constant: fem.Constant) -> bool:
-        """Whether a constant is among them."""
-        return any(constant is mine for mine in self._owners[0])
+        """Return whether the form depends on a constant."""
+        return any(constant is own for own in self._owners[0])
 
     def note(self) -> None:
-        """Note the numbers as they are now."""
-        self._noted = self._numbers()
+        """Record the present values."""
+        self._recorded = self._values()
 
     def forget(self) -> None:
-        """Have nothing noted: for while what depends on them is not complete."""
-        self._noted = None
+        """Discard the record, as long as results that depend on the values are incomplete."""
+        self._recorded = None
 
-    def _numbers(self) -> Array:
+    def _values(self) -> Array:
         return np.concatenate(self._views) if self._views else np.zeros(0)

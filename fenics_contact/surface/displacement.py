@@ -1,8 +1,7 @@
-"""The displacement in what is solved for: all of it, or a part of a mixed function.
+"""The displacement field among the unknowns: all of them, or a part of a mixed function.
 
-Contact is a matter of displacements alone, whatever else is solved for beside them. A displacement
-that is a part of a mixed function has a function of its own here, which follows the mixed one, and
-a sparse map takes its dofs to those of the whole.
+A displacement that is a part of a mixed function is copied to a function of its own. A sparse
+matrix maps its dofs to those of the mixed function.
 """
 
 from __future__ import annotations
@@ -28,29 +27,27 @@ _MIXED = 'mixed_element([element("P", cell, 2, shape=(gdim,)), element("P", cell
 
 
 class Displacement:
-    """A displacement, and the function that is solved for.
+    """A displacement and the function of all unknowns.
 
     The constructor is collective.
 
     Args:
-        u: A vector-valued Lagrange function, or the part of a mixed one that is such, as
-            ``ufl.split`` gives it; parts that are bubbles may be added.
-        mesh: That it must live on; None: its own.
-        name: Of who was given it, in messages.
+        u: A vector-valued Lagrange function, or such a part of a mixed function as returned by
+            ``ufl.split``, to which bubble functions may be added.
+        mesh: Mesh on which it must be defined; None: any.
+        name: Name of the caller for error messages.
 
     Attributes:
-        whole: The function that is solved for.
-        expression: The displacement as UFL, to be differentiated by ``whole``: that itself, or what
-            ``ufl.split`` gives of it, with bubbles if there are any.
-        u: The displacement as a function in a vector-valued Lagrange space of its own: ``whole``
-            itself, or values taken over by `follow`, without bubbles.
-        dofs: Of every dof of ``u`` on this rank, ghosts too, its number in ``whole``; None: the
-            same.
-        degree: Of the elements of ``u``.
-        first: Number of its first component among those of ``whole``.
+        whole: Function of all unknowns.
+        expression: The displacement as UFL, with bubble functions, differentiable by ``whole``.
+        u: The displacement without bubble functions in a vector-valued Lagrange space: ``whole``
+            itself, or a copy updated by `follow`.
+        dofs: Dof of ``whole`` for every dof of ``u`` on this rank, ghosts included; None: the same.
+        degree: Degree of the elements of ``u``.
+        first: Index of its first component among those of ``whole``.
 
     Raises:
-        ValueError: It is no displacement of the mesh.
+        ValueError: ``u`` is not a displacement on the mesh.
     """
 
     def __init__(self, u: Any, mesh: Any, name: str) -> None:
@@ -72,10 +69,10 @@ class Displacement:
 
     @classmethod
     def only(cls, whole: fem.Function, name: str) -> Displacement:
-        """The one part of a function, mixed or not, that can be a displacement. Collective.
+        """Find the only part of a function that can be a displacement. Collective.
 
         Raises:
-            ValueError: There is none, or more than one.
+            ValueError: No part or more than one can be a displacement.
         """
         if not is_mixed(whole.function_space):
             return cls(whole, None, name)
@@ -94,41 +91,41 @@ class Displacement:
 
     @property
     def mixed(self) -> bool:
-        """Whether it is a part of what is solved for, and not all."""
+        """Whether the displacement is a part of a mixed function."""
         return self.dofs is not None
 
     @property
     def n_owned(self) -> int:
-        """Dofs of ``u`` that this rank owns."""
+        """Number of dofs of ``u`` owned by this rank."""
         return _n_owned(self.u)
 
     def same_part(self, other: Displacement) -> bool:
-        """Whether another one is the same part of the same function."""
+        """Return whether another displacement is the same part of the same function."""
         return self.whole is other.whole and self._part == other._part
 
     def is_undifferentiated_in(self, expression: Any) -> bool:
-        """Whether UFL has the displacement itself, and not its gradient alone."""
-        own: list[Any] = [self.whole]
+        """Return whether a UFL expression contains the displacement other than by its gradient."""
+        symbols: list[Any] = [self.whole]
         if self._part is not None:
-            own = [ufl.split(self.whole)[self._part]]
-            own += own[0].ufl_operands  # components, as they are indexed
-        rest, seen = [expand_derivatives(ufl.as_ufl(expression))], set()
-        while rest:
-            item = rest.pop()
-            if item in own:
+            symbols = [ufl.split(self.whole)[self._part]]
+            symbols += symbols[0].ufl_operands  # components, as they are indexed
+        pending, seen = [expand_derivatives(ufl.as_ufl(expression))], set()
+        while pending:
+            item = pending.pop()
+            if item in symbols:
                 return True
             if item not in seen and not isinstance(item, ufl.classes.Grad):
-                rest += item.ufl_operands
+                pending += item.ufl_operands
             seen.add(item)
         return False
 
     def follow(self) -> None:
-        """Take the present values of ``whole`` over into ``u``."""
+        """Copy the present values of ``whole`` to ``u``."""
         if self.dofs is not None:
             self.u.x.array[:] = self.whole.x.array[self.dofs]
 
     def within(self, values: Array) -> Array:
-        """Of values at the owned dofs of ``u`` those at the owned dofs of ``whole``, else 0."""
+        """Extend values at the owned dofs of ``u`` by zero to the owned dofs of ``whole``."""
         if self.dofs is None:
             return values
         found = np.zeros(_n_owned(self.whole))
@@ -136,21 +133,20 @@ class Displacement:
         return found
 
     def vectors(self, values: Array) -> Array:
-        """Of values at the owned dofs of ``whole`` those of ``u``, node by node, (n, gdim)."""
+        """Restrict values at the owned dofs of ``whole`` to the nodes of ``u``, (n, gdim)."""
         owned = np.arange(self.n_owned) if self.dofs is None else self.dofs[: self.n_owned]
         return np.asarray(values[owned]).reshape(-1, self.u.function_space.dofmap.bs)
 
     def lifted(self, matrix: PETSc.Mat) -> PETSc.Mat:
-        """A matrix over the dofs of ``u`` as one over those of ``whole``. Collective.
+        """Map the columns of a matrix from the dofs of ``u`` to those of ``whole``. Collective.
 
-        Args:
-            matrix: Its columns are dofs of ``u``. Returned itself if these are all.
+        The matrix itself is returned if these are the same.
         """
         return matrix if self.dofs is None else matrix.matMult(self._embedding)
 
     @cached_property
     def _embedding(self) -> PETSc.Mat:
-        """One in the row of each dof of ``u``, at its number in ``whole``."""
+        """Boolean matrix that restricts dofs of ``whole`` to those of ``u``."""
         assert self.dofs is not None
         n, index_map = self.n_owned, self.whole.function_space.dofmap.index_map
         columns = index_map.local_to_global(self.dofs[:n]).astype(PETSc.IntType)
@@ -162,10 +158,7 @@ class Displacement:
 
     @cached_property
     def others(self) -> list[tuple[fem.FunctionSpace, Indices]]:
-        """The other parts of ``whole``: a space of its own, and its dofs' numbers. Collective.
-
-        They are made when first asked for, by all ranks.
-        """
+        """The other parts of ``whole``: collapsed spaces and their dofs. Collective once."""
         if self.dofs is None:
             return []
         space = self.whole.function_space
@@ -173,7 +166,7 @@ class Displacement:
 
 
 def is_mixed(space: fem.FunctionSpace) -> bool:
-    """Whether a space is that of several fields."""
+    """Return whether a space is that of a mixed element."""
     return bool(space.num_sub_spaces) and space.dofmap.index_map_bs == 1
 
 
@@ -183,10 +176,10 @@ def _n_owned(function: fem.Function) -> int:
 
 
 def check_kind(u: Any, name: str, advice: str = "") -> None:
-    """Refuse what is neither function nor UFL, with ``advice`` at the end of the message.
+    """Check that ``u`` is a function or UFL; ``advice`` ends the error message.
 
     Raises:
-        ValueError: It says what it is, and where it is several functions what to do.
+        ValueError: ``u`` is of another type, or a list of functions.
     """
     if isinstance(u, list | tuple):
         advice = (
@@ -198,7 +191,7 @@ def check_kind(u: Any, name: str, advice: str = "") -> None:
 
 
 def _check_unmixed(u: fem.Function, name: str) -> None:
-    """Refuse functions of several fields, and parts of them as DOLFINx gives them."""
+    """Check that ``u`` is neither a mixed function nor a subfunction of DOLFINx."""
     if u.function_space.component():
         raise ValueError(
             f"{name}: u is a part of a mixed function given by w.sub(i), on which derivatives with "
@@ -212,11 +205,10 @@ def _check_unmixed(u: fem.Function, name: str) -> None:
 
 
 def _parts(u: ufl.core.expr.Expr, name: str) -> tuple[fem.Function, int]:
-    """The mixed function of a UFL displacement, and which of its parts has its trace.
+    """Return the mixed function of a UFL displacement and the number of its part with a trace.
 
     Raises:
-        ValueError: It is no part of a mixed function, or a sum of other things than bubbles with
-            it.
+        ValueError: ``u`` is not a part of a mixed function, plus bubble functions.
     """
     found = [_part_of(term) for term in _terms(u)]
     wholes = {id(part[0]): part[0] for part in found if part is not None}
@@ -238,14 +230,14 @@ def _parts(u: ufl.core.expr.Expr, name: str) -> tuple[fem.Function, int]:
 
 
 def _terms(u: Any) -> list[Any]:
-    """What a sum is of."""
+    """Return the terms of a sum."""
     if not isinstance(u, ufl.algebra.Sum):
         return [u]
     return [term for operand in u.ufl_operands for term in _terms(operand)]
 
 
 def _part_of(expression: Any) -> tuple[fem.Function, int] | None:
-    """The mixed function and the number of its part that an expression is; None: it is none."""
+    """Return the mixed function and the number of its part; None for other expressions."""
     for whole in ufl.algorithms.extract_coefficients(expression):
         if isinstance(whole, fem.Function) and is_mixed(whole.function_space):
             parts = ufl.split(whole)
@@ -255,7 +247,7 @@ def _part_of(expression: Any) -> tuple[fem.Function, int] | None:
 
 
 def _is_bubble(element: Any) -> bool:
-    """Whether the functions of an element vanish on the facets of cells, by its family."""
+    """Return whether an element consists of bubble functions."""
     return element.basix_element.family == basix.ElementFamily.bubble
 
 

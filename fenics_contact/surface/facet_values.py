@@ -1,4 +1,4 @@
-"""Linear functions on facets that values at their quadrature points make."""
+"""Extrapolation of values at quadrature points to the nodes of facets."""
 
 from __future__ import annotations
 
@@ -11,48 +11,48 @@ __all__ = ["facet_values"]
 
 
 def facet_values(points: Array, measure: Array, values: Array, nodes: Array) -> Array:
-    """Values at nodes of facets from those at points in them, within what the points have.
+    """Extrapolate point values to the nodes of facets without exceeding their range.
 
-    On every facet the linear function that fits the values at its points best, flattened about
-    their mean until none of its nodes is above the largest or below the smallest of them: no
-    pressure where none of the points has any, no pull where none pulls, and the mean, with it the
-    force, is that of the points. Where some of the values are NaN it is the mean of the others.
+    On every facet a linear function is fitted by least squares; its slope is reduced until all
+    nodal values are within the range of the point values. The mean, and so the force, is kept. If
+    some values are NaN, the function is constant, the mean of the others.
 
     Args:
-        points: Places, (n_facets, n_points, d).
-        measure: Area that each stands for, (n_facets, n_points).
-        values: At the points, (n_facets, n_points) or (n_facets, n_points, k).
-        nodes: Places, (n_facets, n_nodes, d).
+        points: Positions of the points, (n_facets, n_points, d).
+        measure: Area of each point, (n_facets, n_points).
+        values: Values at the points, (n_facets, n_points) or (n_facets, n_points, k).
+        nodes: Positions of the nodes, (n_facets, n_nodes, d).
 
     Returns:
-        (n_facets, n_nodes) or (n_facets, n_nodes, k).
+        Nodal values, (n_facets, n_nodes) or (n_facets, n_nodes, k).
     """
     shape = (*nodes.shape[:2], *values.shape[2:])
     values = values.reshape(*values.shape[:2], int(np.prod(values.shape[2:])))
     known: Mask = np.all(np.isfinite(values), axis=2)
-    whole: Mask = np.all(known, axis=1)
-    share = np.where(known, measure, 0.0)
-    total = share.sum(axis=1, keepdims=True)
-    share = np.divide(share, total, out=np.full_like(share, np.nan), where=total > 0)
+    complete: Mask = np.all(known, axis=1)
+    weight = np.where(known, measure, 0.0)
+    total = weight.sum(axis=1, keepdims=True)
+    weight = np.divide(weight, total, out=np.full_like(weight, np.nan), where=total > 0)
     filled = np.where(known[:, :, None], values, 0.0)
-    mean = np.einsum("fp,fpk->fk", share, filled)[:, None]
-    share = np.nan_to_num(share)
-    middle = np.einsum("fp,fpd->fd", share, points)[:, None]
-    root = np.sqrt(share)[:, :, None]
-    # Along the facet alone: its points, and those of a curved one nearly, are in a plane.
-    _, size, ways = np.linalg.svd(root * (points - middle), full_matrices=False)
-    size, ways = size[:, : points.shape[2] - 1], ways[:, : points.shape[2] - 1]
-    used = (size > FLAT * size[:, :1].clip(min=1e-300)) & whole[:, None]
-    inverse = np.divide(1.0, size**2, out=np.zeros_like(size), where=used)
-    along = np.einsum("fpd,fwd->fpw", points - middle, ways)
-    slope = np.einsum("fw,fpw,fp,fpk->fwk", inverse, along, share, filled)
-    change = np.einsum("fnd,fwd,fwk->fnk", nodes - middle, ways, slope)
-    # How much of the change the range of the points allows, by facet and component.
+    mean = np.einsum("fp,fpk->fk", weight, filled)[:, None]
+    weight = np.nan_to_num(weight)
+    middle = np.einsum("fp,fpd->fd", weight, points)[:, None]
+    root = np.sqrt(weight)[:, :, None]
+    # The points of a facet are, nearly, in a plane: only its directions are used.
+    _, size, directions = np.linalg.svd(root * (points - middle), full_matrices=False)
+    size, directions = size[:, : points.shape[2] - 1], directions[:, : points.shape[2] - 1]
+    determined = (size > FLAT * size[:, :1].clip(min=1e-300)) & complete[:, None]
+    inverse = np.divide(1.0, size**2, out=np.zeros_like(size), where=determined)
+    along = np.einsum("fpd,fwd->fpw", points - middle, directions)
+    slope = np.einsum("fw,fpw,fp,fpk->fwk", inverse, along, weight, filled)
+    variation = np.einsum("fnd,fwd,fwk->fnk", nodes - middle, directions, slope)
     low, high = filled.min(axis=1, keepdims=True), filled.max(axis=1, keepdims=True)
     with np.errstate(over="ignore"):  # of changes next to nothing
-        room = np.where(change > 0, high - mean, low - mean)
-        room = np.divide(room, change, out=np.ones_like(change), where=np.abs(change) > 0)
-    allowed = np.clip(room.min(axis=1, keepdims=True), 0.0, 1.0)
-    fitted = mean + allowed * change
-    fitted[whole] = np.clip(fitted[whole], low[whole], high[whole])  # to the last digit
+        bound = np.where(variation > 0, high - mean, low - mean)
+        bound = np.divide(
+            bound, variation, out=np.ones_like(variation), where=np.abs(variation) > 0
+        )
+    fraction = np.clip(bound.min(axis=1, keepdims=True), 0.0, 1.0)
+    fitted = mean + fraction * variation
+    fitted[complete] = np.clip(fitted[complete], low[complete], high[complete])  # to the last digit
     return fitted.reshape(shape)
