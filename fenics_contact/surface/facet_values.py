@@ -45,14 +45,12 @@ def facet_values(points: Array, measure: Array, values: Array, nodes: Array) -> 
     inverse = np.divide(1.0, size**2, out=np.zeros_like(size), where=determined)
     along = np.einsum("fpd,fwd->fpw", points - middle, directions)
     slope = np.einsum("fw,fpw,fp,fpk->fwk", inverse, along, weight, filled)
-    variation = np.einsum("fnd,fwd,fwk->fnk", nodes - middle, directions, slope)
+    change = np.einsum("fnd,fwd,fwk->fnk", nodes - middle, directions, slope)
     low, high = filled.min(axis=1, keepdims=True), filled.max(axis=1, keepdims=True)
-    with np.errstate(over="ignore"):  # of changes next to nothing
-        bound = np.where(variation > 0, high - mean, low - mean)
-        bound = np.divide(
-            bound, variation, out=np.ones_like(variation), where=np.abs(variation) > 0
-        )
+    with np.errstate(over="ignore"):  # division by tiny changes
+        bound = np.where(change > 0, high - mean, low - mean)
+        bound = np.divide(bound, change, out=np.ones_like(change), where=np.abs(change) > 0)
     fraction = np.clip(bound.min(axis=1, keepdims=True), 0.0, 1.0)
-    fitted = mean + fraction * variation
-    fitted[complete] = np.clip(fitted[complete], low[complete], high[complete])  # to the last digit
+    fitted = mean + fraction * change
+    fitted[complete] = np.clip(fitted[complete], low[complete], high[complete])  # exactly
     return fitted.reshape(shape)
