@@ -52,7 +52,7 @@ class FacetPlaces:
         self._element = basix.create_element(
             basix.ElementFamily.P, self.facets.kind, degree, basix.LagrangeVariant.gll_warped
         )
-        self._nodes = self.facets.each(self._element.points)
+        self._nodes = self.facets.combine(self._element.points)
         # The degree is limited to that of geometry and displacement: more points are fitted.
         basis = polynomials(self.facets.kind, min(n_points, self._element.dim))
         table = tabulate(basis, 0, at)[0, :, :, 0].reshape(n_facets, n_points, basis.dim)
@@ -132,4 +132,4 @@ class FacetPlaces:
 
     def piece_middles(self) -> Array:
         """Return the centres of the facets' flat pieces on the undeformed Γc, (n, gdim)."""
-        return self.facets.positions(*self.facets.each(self._pieces.mean(axis=1)))[0]
+        return self.facets.positions(*self.facets.combine(self._pieces.mean(axis=1)))[0]

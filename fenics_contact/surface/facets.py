@@ -1,4 +1,4 @@
-"""Geometry of a set of facets: places on them, and where rays meet them."""
+"""Geometry of a set of facets: positions, normals and intersections with rays."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["FacetSet", "across", "facet_cells", "facet_nodes", "local_facets", "tabulate"]
 
-# Of points, facets, places on them and signed distances: which of these hits count.
+# Rule that selects admissible hits by point, facet, reference coordinates and signed distance.
 Rule: TypeAlias = Callable[[Index, Index, Array, Array], Mask]
 
-# Facets tried first for every point, nearest first; more only where these need not be enough.
-_NEAREST = 12
-_NEWTON_STEPS = 25
-# Pairs of points and facets looked at in one go, to bound the memory.
-_CHUNK = 2_000_000
-# How far from its middle a curved facet reaches, by the farthest of its corners.
-_BENT = 1.3
+# Nearest facets that are tested first for every point.
+_FIRST_CANDIDATES = 12
+_MAX_NEWTON_STEPS = 25
+# Point-facet pairs tested at once, which limits the memory.
+_PAIRS_PER_CHUNK = 2_000_000
+# Radius of a curved facet relative to the distance of its farthest corner.
+_CURVED_RADIUS_RATIO = 1.3
 
 
 def facet_cells(mesh: dolfinx.mesh.Mesh, facets: Index) -> Index:
-    """The cell of every exterior facet of this rank, (n_facets,)."""
+    """Return the cell of every exterior facet of this rank, (n_facets,)."""
     d = mesh.topology.dim
     mesh.topology.create_connectivity(d - 1, d)
     to_cell = mesh.topology.connectivity(d - 1, d)
@@ -38,7 +38,7 @@ def facet_cells(mesh: dolfinx.mesh.Mesh, facets: Index) -> Index:
 
 
 def local_facets(mesh: dolfinx.mesh.Mesh, facets: Index) -> Index:
-    """The number of every exterior facet of this rank in its cell, (n_facets,)."""
+    """Return the local number of every exterior facet in its cell, (n_facets,)."""
     d = mesh.topology.dim
     mesh.topology.create_connectivity(d, d - 1)
     n = len(basix.topology(basix.CellType[mesh.topology.cell_name()])[d - 1])
@@ -47,7 +47,7 @@ def local_facets(mesh: dolfinx.mesh.Mesh, facets: Index) -> Index:
 
 
 def facet_nodes(space: fem.FunctionSpace, facets: Index) -> Index:
-    """The nodes of a space on every exterior facet of this rank, (n_facets, n_nodes)."""
+    """Return the nodes of a space on every exterior facet of this rank, (n_facets, n_nodes)."""
     mesh, layout = space.mesh, space.dofmap.dof_layout
     fdim = mesh.topology.dim - 1
     n = len(basix.topology(basix.CellType[mesh.topology.cell_name()])[fdim])
@@ -57,18 +57,18 @@ def facet_nodes(space: fem.FunctionSpace, facets: Index) -> Index:
 
 
 class FacetSet:
-    """Facets of this rank, with reference coordinates of their own, of dimension d - 1.
+    """Facets of this rank, parametrised by reference coordinates ξ of dimension d - 1.
 
     Args:
-        space: Displacement space, for displaced places and its basis.
+        space: Displacement space.
         facets: Facets of this rank, (n_facets,).
 
     Attributes:
         cells: Cell of every facet, (n_facets,).
-        nodes: Of the displacement on every facet, numbered on this rank, (n_facets, n_nodes).
-        kind: Of the facets, as Basix has it.
+        nodes: Local numbers of the displacement nodes on every facet, (n_facets, n_nodes).
+        kind: Cell type of the facets.
         simplex: Whether the cells are simplices.
-        outward: Sign by which the facet's own orientation points out of the body, (n_facets,).
+        outward: Sign of the facet's own orientation relative to the outward one, (n_facets,).
     """
 
     def __init__(self, space: fem.FunctionSpace, facets: Index) -> None:
@@ -87,52 +87,46 @@ class FacetSet:
         self.kind = basix.CellType.interval
         if d == 3:
             self.kind = basix.CellType["triangle" if self.simplex else "quadrilateral"]
-        places = basix.geometry(self.kind)
+        vertices = basix.geometry(self.kind)
         ring = [0, 1, 3, 2] if d == 3 and not self.simplex else list(range(d))
-        self._corners, self._middle = places[ring], places.mean(axis=0, keepdims=True)
+        self._corners, self._middle = vertices[ring], vertices.mean(axis=0, keepdims=True)
         self._at_corners = np.array(topology[d - 1])[local][:, ring]
         self._geometry_basis = compat.geometry_element(mesh)
         self._basis = space.element.basix_element
         self._nodes = compat.geometry_dofmap(mesh)[self.cells]
         self._dofs = space.dofmap.list[self.cells]
-        on_facet, tangents = self.positions(*self.each(self._middle))
+        on_facet, tangents = self.positions(*self.combine(self._middle))
         table = tabulate(self._geometry_basis, 0, geometry.mean(axis=0)[None])[0, 0, :, 0]
         inside = np.einsum("k,pkd->pd", table, self._x[self._nodes][:, :, :d])
-        self.outward = _side(tangents, on_facet - inside)
+        self.outward = _orientation(tangents, on_facet - inside)
 
-    def each(self, places: Array, facets: Index | None = None) -> tuple[Index, Array]:
-        """Facets, by default all, with each of the places, (m, d - 1): (n m,), (n m, d - 1)."""
+    def combine(self, points: Array, facets: Index | None = None) -> tuple[Index, Array]:
+        """Combine facets, by default all, with reference points: (n m,), (n m, d - 1)."""
         facets = np.arange(len(self.cells)) if facets is None else facets
-        return np.repeat(facets, len(places)), np.tile(places, (len(facets), 1))
+        return np.repeat(facets, len(points)), np.tile(points, (len(facets), 1))
 
-    def _in_cell(self, facet: Index, place: Array) -> Array:
-        """Reference coordinates of the cell from those of the facet: (n, d)."""
-        along = self._edges[facet] @ place[:, :, None]
+    def _in_cell(self, facet: Index, xi: Array) -> Array:
+        """Map reference coordinates of facets to those of their cells, (n, d)."""
+        along = self._edges[facet] @ xi[:, :, None]
         return np.asarray(self._origin[facet] + along[:, :, 0])
 
     def _weights(self, basis: Any, facet: Index, points: Array) -> Array:
-        """Values of a basis, then derivatives by the facet's coordinates, (n, d, n_basis).
-
-        Args:
-            basis: Of the cells.
-            facet: Facet of every point, (n,).
-            points: Reference coordinates of the cell, (n, d).
-        """
+        """Tabulate a cell basis and its derivatives by ξ at points of the cell, (n, d, n_basis)."""
         table = np.swapaxes(tabulate(basis, 1, points)[..., 0], 0, 1)
         slopes = np.swapaxes(self._edges[facet], 1, 2) @ table[:, 1:]
         return np.concatenate([table[:, :1], slopes], axis=1)
 
     def positions(
-        self, facet: Index, place: Array, u: fem.Function | None = None
+        self, facet: Index, xi: Array, u: fem.Function | None = None
     ) -> tuple[Array, Array]:
-        """Places in space, (n, d), and their derivatives by the coordinates, (n, d, d - 1).
+        """Return positions x(ξ), (n, d), and tangents ∂x/∂ξ, (n, d, d - 1).
 
         Args:
             facet: Facet of every point, (n,).
-            place: Reference coordinates on it, (n, d - 1).
-            u: Displacement to add; none: the undeformed body.
+            xi: Reference coordinates on it, (n, d - 1).
+            u: Displacement; None: the undeformed body.
         """
-        points = self._in_cell(facet, place)
+        points = self._in_cell(facet, xi)
         nodes = self._x[self._nodes[facet]][:, :, : self._d]
         found = self._weights(self._geometry_basis, facet, points) @ nodes
         if u is not None:
@@ -140,54 +134,51 @@ class FacetSet:
             found += self._weights(self._basis, facet, points) @ values
         return found[:, 0], np.swapaxes(found[:, 1:], 1, 2)
 
-    def normals(self, facet: Index, place: Array, u: fem.Function | None = None) -> Array:
-        """Outward unit normals, (n, d), of the body displaced by ``u``."""
-        return self.outward_normals(facet, self.positions(facet, place, u)[1])
+    def normals(self, facet: Index, xi: Array, u: fem.Function | None = None) -> Array:
+        """Return outward unit normals of the body displaced by ``u``, (n, d)."""
+        return self.outward_normals(facet, self.positions(facet, xi, u)[1])
 
     def outward_normals(self, facet: Index, tangents: Array) -> Array:
-        """Outward unit normals, (n, d), across the tangents of `positions`."""
+        """Return outward unit normals, (n, d), from tangents as returned by `positions`."""
         outward = self.outward[facet, None] * across(tangents)
         return np.asarray(outward / np.linalg.norm(outward, axis=1, keepdims=True))
 
     def moved_corners(self, u: fem.Function | None) -> Array:
-        """Corners displaced by ``u``, (n_facets, n_corners, d)."""
-        places, _ = self.positions(*self.each(self._corners), u)
-        return places.reshape(len(self.cells), len(self._corners), self._d)
+        """Return the corners displaced by ``u``, (n_facets, n_corners, d)."""
+        corners, _ = self.positions(*self.combine(self._corners), u)
+        return corners.reshape(len(self.cells), len(self._corners), self._d)
 
-    def balls(self, u: fem.Function | None) -> tuple[Array, Array]:
-        """Balls around the facets displaced by ``u``: middles, (n_facets, d), and radii."""
-        middle, _ = self.positions(*self.each(self._middle), u)
-        away = np.linalg.norm(self.moved_corners(u) - middle[:, None], axis=2)
-        return middle, _BENT * away.max(axis=1, initial=0.0)
+    def bounding_balls(self, u: fem.Function | None) -> tuple[Array, Array]:
+        """Return bounding balls of the displaced facets: centres, (n_facets, d), and radii."""
+        middle, _ = self.positions(*self.combine(self._middle), u)
+        arms = np.linalg.norm(self.moved_corners(u) - middle[:, None], axis=2)
+        return middle, _CURVED_RADIUS_RATIO * arms.max(axis=1, initial=0.0)
 
     def mean_normals(self) -> Array:
-        """Outward unit normals at the facets' middles, (n_facets, d)."""
-        return self.normals(*self.each(self._middle))
+        """Return outward unit normals at the facets' centres, (n_facets, d)."""
+        return self.normals(*self.combine(self._middle))
 
     def corners(self) -> tuple[Index, Array]:
-        """Every facet with each of its corners and its middle: (n,), places (n, d - 1)."""
-        return self.each(np.vstack([self._corners, self._middle]))
+        """Return all facets with their corners and centres: facets, (n,), and ξ, (n, d - 1)."""
+        return self.combine(np.vstack([self._corners, self._middle]))
 
     def lattice(self, facets: Index | None = None) -> tuple[Index, Array]:
-        """Facets with their corners, the middles of their edges and their own middle.
-
-        Args:
-            facets: Which ones; by default all of this rank.
+        """Return facets, by default all, with their corners, edge midpoints and centres.
 
         Returns:
-            The facets, (n,), and reference coordinates on them, (n, d - 1).
+            Facets, (n,), and reference coordinates on them, (n, d - 1).
         """
-        places = np.vstack([self._corners, self._middle])
+        points = np.vstack([self._corners, self._middle])
         if self._d == 3:
             edges = (self._corners + np.roll(self._corners, -1, axis=0)) / 2
-            places = np.vstack([places, edges])
-        return self.each(places, facets)
+            points = np.vstack([points, edges])
+        return self.combine(points, facets)
 
     def flat_pieces(self, degree: int) -> Array:
-        """Reference corners of the pieces, in order, that are taken as flat: (n, n_corners, d - 1).
+        """Return reference corners of the flat pieces of a facet, (n, n_corners, d - 1).
 
         Args:
-            degree: Of the polynomials on the facets; those of degree 1 are one piece.
+            degree: Polynomial degree of the facets; those of degree 1 are one piece.
         """
         corner = self._corners
         if degree == 1:
@@ -202,159 +193,157 @@ class FacetSet:
         return np.stack([corner, edge, middle, previous], axis=1)
 
     def clipped(self, reference: Array) -> Array:
-        """Reference coordinates of the places, (n, d - 1), moved onto the facet."""
+        """Clip reference coordinates, (n, d - 1), to the facet."""
         inside = np.clip(reference, 0.0, 1.0)
         if self.simplex:
             inside /= np.maximum(inside.sum(axis=1, keepdims=True), 1.0)
         return inside
 
     def corner_vertices(self) -> Index:
-        """Global numbers of the facets' vertices, see `vertices`, (n_facets, n_corners)."""
+        """Return global vertex numbers of the facets, (n_facets, n_corners)."""
         return np.take_along_axis(self.vertices(), self._at_corners, axis=1)
 
     def heights(self) -> Array:
-        """How far the cells reach below their facets, (n_facets,) (length)."""
-        middle, _ = self.positions(*self.each(self._middle))
+        """Return the heights of the cells over their facets, (n_facets,) (length)."""
+        middle, _ = self.positions(*self.combine(self._middle))
         arm = middle[:, None] - self._x[self._nodes][:, :, : self._d]
         depth: Array = np.einsum("fkd,fd->fk", arm, self.mean_normals())
         return depth.max(axis=1, initial=0.0)
 
     def vertices(self) -> Index:
-        """Global numbers of the cells' vertices, as nodes of the displacement: (n_facets, n)."""
+        """Return global vertex numbers of the cells, as displacement nodes, (n_facets, n)."""
         n = len(basix.topology(basix.CellType[self.space.mesh.topology.cell_name()])[0])
         layout = self.space.dofmap.dof_layout
         local = self._dofs[:, [layout.entity_dofs(0, i)[0] for i in range(n)]]
         nodes = self.space.dofmap.index_map.local_to_global(local.ravel().astype(np.int32))
         return nodes.reshape(local.shape)
 
-    def interpolation(self, facet: Index, place: Array) -> tuple[Index, Array]:
-        """Global nodes of the displacement at places, (n, n_basis), and their weights.
+    def interpolation(self, facet: Index, xi: Array) -> tuple[Index, Array]:
+        """Return global displacement nodes, (n, n_basis), and their weights at points.
 
-        The weights, (n, d, n_basis), are values, then derivatives by the places.
+        The weights, (n, d, n_basis), are basis functions and their derivatives by ξ.
         """
         local = self._dofs[facet]
         nodes = self.space.dofmap.index_map.local_to_global(local.ravel().astype(np.int32))
-        weights = self._weights(self._basis, facet, self._in_cell(facet, place))
+        weights = self._weights(self._basis, facet, self._in_cell(facet, xi))
         return nodes.reshape(local.shape), weights
 
     def search(
-        self, x: Array, ray: Array, u: fem.Function | None, counts: Rule
+        self, x: Array, ray: Array, u: fem.Function | None, accept: Rule
     ) -> tuple[Index, Array, Array]:
-        """The nearest facet of this rank that looks back along each ray.
+        """Find the nearest facet of this rank that each ray hits and that faces its origin.
 
         Args:
-            x: Points, (n, d).
-            ray: Unit directions, (n, d); facets behind the point are met too.
-            u: Displacement of the facets; none: they are undeformed.
-            counts: Which hits are taken.
+            x: Origins, (n, d).
+            ray: Unit directions, (n, d); facets behind the origin are hit, too.
+            u: Displacement of the facets; None: undeformed.
+            accept: Rule that selects admissible hits.
 
         Returns:
-            Facet or -1, (n,); place on it, (n, d - 1); signed distance along the ray, (n,).
+            Facet or -1, (n,); reference coordinates, (n, d - 1); signed distance, (n,).
         """
         n, d, n_facets = len(x), self._d, len(self.cells)
         best = (np.full(n, -1), np.zeros((n, d - 1)), np.full(n, np.inf))
         if n_facets == 0 or n == 0:
             return best
-        middle, radius = self.balls(u)
-        near = min(_NEAREST, n_facets)
-        away, candidates = scipy.spatial.cKDTree(middle).query(x, k=[*range(1, near + 1)])
+        middle, radius = self.bounding_balls(u)
+        near = min(_FIRST_CANDIDATES, n_facets)
+        distances, candidates = scipy.spatial.cKDTree(middle).query(x, k=[*range(1, near + 1)])
         point, facet = np.repeat(np.arange(n), near), candidates.reshape(-1)
         arm = middle[facet] - x[point]
         along = np.einsum("nd,nd->n", arm, ray[point])
-        off = np.linalg.norm(arm - along[:, None] * ray[point], axis=1)
-        hopeful = off <= radius[facet]
-        self._keep_nearest(x, ray, (point[hopeful], facet[hopeful]), u, best, counts)
+        lateral = np.linalg.norm(arm - along[:, None] * ray[point], axis=1)
+        candidate = lateral <= radius[facet]
+        self._update_nearest(x, ray, (point[candidate], facet[candidate]), u, best, accept)
         if near == n_facets:
             return best
-        # The nearest need not be the ones ahead: a long facet, or a far one. Where something was
-        # met, all that is nearer has its middle within its own radius of there.
-        missed = best[0] < 0
-        unsure = ~missed & (away[:, -1] < np.abs(best[2]) + radius.max())
-        for rows in (np.flatnonzero(missed), np.flatnonzero(unsure)):
-            step = max(1, _CHUNK // n_facets)
+        # The nearest centres need not belong to the facets that are hit. All facets nearer than a
+        # hit have their centres closer than its distance plus their radius.
+        no_hit = best[0] < 0
+        uncertain = ~no_hit & (distances[:, -1] < np.abs(best[2]) + radius.max())
+        for rows in (np.flatnonzero(no_hit), np.flatnonzero(uncertain)):
+            step = max(1, _PAIRS_PER_CHUNK // n_facets)
             for i in range(0, len(rows), step):
-                some = rows[i : i + step]
-                along, off = _every_along_and_off(middle, x[some], ray[some])
-                hopeful = off <= radius[None]
-                hopeful &= np.abs(along) <= np.abs(best[2][some, None]) + radius[None]
-                row, facet = np.nonzero(hopeful)
-                self._keep_nearest(x, ray, (some[row], facet), u, best, counts)
+                chunk = rows[i : i + step]
+                along, lateral = _ray_distances(middle, x[chunk], ray[chunk])
+                candidate = lateral <= radius[None]
+                candidate &= np.abs(along) <= np.abs(best[2][chunk, None]) + radius[None]
+                row, facet = np.nonzero(candidate)
+                self._update_nearest(x, ray, (chunk[row], facet), u, best, accept)
         return best
 
-    def _keep_nearest(
-        self, x: Array, ray: Array, pairs: tuple[Index, Index], u: Any, best: Any, counts: Rule
+    def _update_nearest(
+        self, x: Array, ray: Array, pairs: tuple[Index, Index], u: Any, best: Any, accept: Rule
     ) -> None:
-        """Meet the facets of some pairs and keep the nearest hits in ``best``."""
+        """Intersect pairs of rays and facets and store the nearest hits in ``best``."""
         point, facet = pairs
-        place, distance, met, tangents = self.meet(facet, x[point], ray[point], u)
-        # Only a facet that looks back at the point can be opposite.
-        facing = self.outward[facet] * _side(tangents, ray[point]) < 0
-        good = np.flatnonzero(met & facing)
-        good = good[counts(point[good], facet[good], place[good], distance[good])]
-        point, facet, place, distance = point[good], facet[good], place[good], distance[good]
+        xi, distance, hit, tangents = self.intersect(facet, x[point], ray[point], u)
+        facing = self.outward[facet] * _orientation(tangents, ray[point]) < 0
+        rows = np.flatnonzero(hit & facing)
+        rows = rows[accept(point[rows], facet[rows], xi[rows], distance[rows])]
+        point, facet, xi, distance = point[rows], facet[rows], xi[rows], distance[rows]
         order = np.lexsort((facet, np.abs(distance), point))
         chosen = order[np.append(True, np.diff(point[order]) > 0)[: len(order)]]
         chosen = chosen[np.abs(distance[chosen]) < np.abs(best[2][point[chosen]])]
-        for target, values in zip(best, (facet, place, distance), strict=True):
+        for target, values in zip(best, (facet, xi, distance), strict=True):
             target[point[chosen]] = values[chosen]
 
     def locate(self, facet: Index, x: Array, u: fem.Function | None = None) -> Array:
-        """Reference coordinates of places on their facets, (n, d - 1).
+        """Return reference coordinates of points on their facets, (n, d - 1).
 
         Args:
-            facet: Facet of every place, (n,).
-            x: The places, (n, d); what is off the facet counts as if it were moved onto it along
-                the mean normal of the undeformed facet.
-            u: Displacement of the facets; none: they are undeformed.
+            facet: Facet of every point, (n,).
+            x: Points, (n, d), projected along the mean normal of the undeformed facet.
+            u: Displacement of the facets; None: undeformed.
         """
-        return self.meet(facet, x, self.mean_normals()[facet], u)[0]
+        return self.intersect(facet, x, self.mean_normals()[facet], u)[0]
 
-    def meet(
+    def intersect(
         self, facet: Index, x: Array, ray: Array, u: fem.Function | None = None
     ) -> tuple[Array, Array, Mask, Array]:
-        """Where rays meet given facets, by Newton's method, all at once.
+        """Intersect rays with given facets by Newton's method, all at once.
 
         Returns:
-            Places, (n, d - 1); signed distances, (n,); whether the facet itself was met, (n,); and
-            the tangents of `positions` there.
+            Reference coordinates, (n, d - 1); signed distances, (n,); whether the facet was hit,
+            (n,); tangents as returned by `positions`.
         """
         d = self._d
-        place: Array = self._middle.repeat(len(facet), axis=0)
+        xi: Array = self._middle.repeat(len(facet), axis=0)
         distance: Array = np.zeros(len(facet))
         singular = np.zeros(len(facet), dtype=bool)
-        rows: Index = np.arange(len(facet))  # those still on their way
-        for _ in range(_NEWTON_STEPS):
-            position, tangents = self.positions(facet[rows], place[rows], u)
-            rest = position - x[rows] - distance[rows, None] * ray[rows]
+        rows: Index = np.arange(len(facet))  # not converged
+        for _ in range(_MAX_NEWTON_STEPS):
+            position, tangents = self.positions(facet[rows], xi[rows], u)
+            residual = position - x[rows] - distance[rows, None] * ray[rows]
             system = np.concatenate([tangents, -ray[rows, :, None]], axis=2)
-            # A facet along the ray is never met; its singular system must not stop the others.
+            # Facets parallel to the ray have a singular system and are never hit.
             size = np.prod(np.linalg.norm(system, axis=1), axis=1)
             singular[rows] = np.abs(np.linalg.det(system)) < ROUND_OFF * size
             system[singular[rows]] = np.eye(d)
-            rest[singular[rows]] = 0.0
-            step = np.linalg.solve(system, -rest[..., None])[..., 0]
-            # Far outside, a curved facet may bend any way: stay near it. What does not move any
-            # more has met the facet, or wants to leave there, now and in every further step.
-            old = place[rows]
-            place[rows] = np.clip(old + step[:, :-1], -1.0, 2.0)
+            residual[singular[rows]] = 0.0
+            step = np.linalg.solve(system, -residual[..., None])[..., 0]
+            # Iterates are limited to the neighbourhood of the facet, outside of which curved facets
+            # are meaningless. An iterate that stays has converged or is at that limit.
+            old = xi[rows]
+            xi[rows] = np.clip(old + step[:, :-1], -1.0, 2.0)
             distance[rows] += step[:, -1]
-            rows = rows[np.any(np.abs(place[rows] - old) >= 1e-13, axis=1)]
+            rows = rows[np.any(np.abs(xi[rows] - old) >= 1e-13, axis=1)]
             if not len(rows):
                 break
-        position, tangents = self.positions(facet, place, u)
-        rest = np.linalg.norm(position - x - distance[:, None] * ray, axis=1)
+        position, tangents = self.positions(facet, xi, u)
+        residual = np.linalg.norm(position - x - distance[:, None] * ray, axis=1)
         size = np.linalg.norm(tangents, axis=1).max(axis=1, initial=0.0)
-        # Neighbours overlap, so that no ray slips through between them.
-        met = ~singular & (rest <= 1e-10 * size) & np.all(place >= -FLAT, axis=1)
+        # The tolerance makes neighbours overlap, so that no ray passes between them.
+        hit = ~singular & (residual <= 1e-10 * size) & np.all(xi >= -FLAT, axis=1)
         if self.simplex:
-            met &= place.sum(axis=1) <= 1 + FLAT
+            hit &= xi.sum(axis=1) <= 1 + FLAT
         else:
-            met &= np.all(place <= 1 + FLAT, axis=1)
-        return place, distance, met, tangents
+            hit &= np.all(xi <= 1 + FLAT, axis=1)
+        return xi, distance, hit, tangents
 
 
 def tabulate(element: Any, derivatives: int, points: Array) -> Array:
-    """Tabulate a basix element, also at no points at all, where basix aborts."""
+    """Tabulate a Basix element, also at zero points, for which Basix aborts."""
     if len(points):
         return element.tabulate(derivatives, points)
     n_tables = (1, 1 + points.shape[1])[derivatives]
@@ -362,21 +351,21 @@ def tabulate(element: Any, derivatives: int, points: Array) -> Array:
 
 
 def across(tangents: Array) -> Array:
-    """Vectors across tangents (n, d, d - 1), (n, d), with which these are oriented positively."""
+    """Return vectors normal to tangents (n, d, d - 1), positively oriented with them, (n, d)."""
     if tangents.shape[1] == 2:
         return np.column_stack([-tangents[:, 1, 0], tangents[:, 0, 0]])
     return np.asarray(np.cross(tangents[:, :, 0], tangents[:, :, 1]), dtype=np.float64)
 
 
-def _every_along_and_off(middle: Array, x: Array, ray: Array) -> tuple[Array, Array]:
-    """How far places (m, d) are along each unit ray from x, (n, d), and aside of it: (n, m)."""
-    origin = middle.mean(axis=0)  # from afar differences of squares would lose their digits
-    there, here = middle - origin, x - origin
-    along = ray @ there.T - np.sum(here * ray, axis=1)[:, None]
-    away = np.sum(here**2, axis=1)[:, None] + np.sum(there**2, axis=1) - 2 * here @ there.T
-    return along, np.sqrt(np.maximum(away - along**2, 0.0))
+def _ray_distances(middle: Array, x: Array, ray: Array) -> tuple[Array, Array]:
+    """Return axial and lateral distances of points (m, d) from unit rays at x, (n, d): (n, m)."""
+    origin = middle.mean(axis=0)  # reduces cancellation
+    points, starts = middle - origin, x - origin
+    along = ray @ points.T - np.sum(starts * ray, axis=1)[:, None]
+    square = np.sum(starts**2, axis=1)[:, None] + np.sum(points**2, axis=1) - 2 * starts @ points.T
+    return along, np.sqrt(np.maximum(square - along**2, 0.0))
 
 
-def _side(tangents: Array, direction: Array) -> Array:
-    """Sign of directions against oriented facets: (n,)."""
+def _orientation(tangents: Array, direction: Array) -> Array:
+    """Return the signs of directions relative to oriented facets, (n,)."""
     return np.sign(np.linalg.det(np.concatenate([tangents, direction[:, :, None]], axis=2)))

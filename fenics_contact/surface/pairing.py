@@ -184,8 +184,8 @@ class Pairing:
             depth: Largest penetration of the points (length).
         """
         comm, sides = self._comm, self._sides
-        ends = [side.facets.balls(u) for side in sides]
-        starts = ends if before is None else [side.facets.balls(before) for side in sides]
+        ends = [side.facets.bounding_balls(u) for side in sides]
+        starts = ends if before is None else [side.facets.bounding_balls(before) for side in sides]
         ways = [end[0] - start[0] for start, end in zip(starts, ends, strict=True)]
         shift = global_mean(comm, ways[0])  # by which all have moved together
         balls = []
