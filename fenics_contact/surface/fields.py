@@ -1,4 +1,4 @@
-"""The committed state of a contact: fields at the quadrature points of Γc."""
+"""Fields at the quadrature points of Γc, such as the history variables of a contact."""
 
 from __future__ import annotations
 
@@ -15,16 +15,15 @@ __all__ = ["PointFields"]
 
 
 class PointFields:
-    """Named fields in one quadrature function, changed by `assign` and `set_rows` alone.
+    """Named fields in one quadrature function, initially zero.
 
-    All are zero at first. The constructor is collective.
+    They are changed by `assign` and `set_rows` only. The constructor is collective.
 
     Args:
-        fields: Number of components by name; 0 stands for a scalar.
+        fields: Number of components by name; 0 for a scalar.
 
     Attributes:
-        function: The function that holds all fields, for use in forms (a coefficient on the
-            submesh of Γc).
+        function: All fields as a coefficient of forms, defined on the submesh of Γc.
     """
 
     def __init__(self, quadrature: SurfaceQuadrature, fields: Mapping[str, int]) -> None:
@@ -38,7 +37,7 @@ class PointFields:
         self._size = size
 
     def __contains__(self, name: str) -> bool:
-        """Whether there is such a field."""
+        """Return whether a field exists."""
         return name in self._slices
 
     @property
@@ -47,26 +46,26 @@ class PointFields:
         return list(self._slices)
 
     def ufl(self, name: str) -> ufl.core.expr.Expr:
-        """The field as a UFL scalar or vector, for use in forms."""
-        place = self._slices[name]
-        if isinstance(place, int):
-            return self.function[place]
-        return ufl.as_vector([self.function[i] for i in range(place.start, place.stop)])
+        """Return the field as a UFL scalar or vector."""
+        columns = self._slices[name]
+        if isinstance(columns, int):
+            return self.function[columns]
+        return ufl.as_vector([self.function[i] for i in range(columns.start, columns.stop)])
 
     def values(self, name: str) -> Array:
-        """Values at the owned points, (n_points,) or (n_points, d); a copy."""
+        """Return a copy of the values at the owned points, (n_points,) or (n_points, d)."""
         rows = self.function.x.array.reshape(-1, self._size)
         return rows[: self._n_owned, self._slices[name]].copy()
 
     def rows(self) -> Array:
-        """All fields at the owned points, (n_points, n_components); a copy."""
+        """Return a copy of all fields at the owned points, (n_points, n_components)."""
         return self.function.x.array.reshape(-1, self._size)[: self._n_owned].copy()
 
     def set_rows(self, rows: Array) -> None:
-        """Put back what `rows` gave. Collective.
+        """Set all fields from an array as returned by `rows`. Collective.
 
         Raises:
-            ValueError: The shape is another.
+            ValueError: The shape is wrong.
         """
         array = self.function.x.array.reshape(-1, self._size)
         if rows.shape != (self._n_owned, self._size):
@@ -77,22 +76,22 @@ class PointFields:
         self.function.x.scatter_forward()
 
     def packed(self, values: Mapping[str, Array]) -> Array:
-        """Return fields given by name as `rows` has them, (n_points, n_components).
+        """Return named fields as one array ordered as `rows`, (n_points, n_components).
 
         Raises:
             KeyError: A field is missing.
             ValueError: A shape is wrong.
         """
         rows = np.empty((self._n_owned, self._size))
-        for name, place in self._slices.items():
-            rows[:, place] = values[name]
+        for name, columns in self._slices.items():
+            rows[:, columns] = values[name]
         return rows
 
     def assign(self, values: Mapping[str, Array]) -> None:
-        """Replace every field by its values at the owned points. Collective.
+        """Set all fields by name at the owned points. Collective.
 
         Raises:
-            KeyError: A field is missing; nothing has changed then.
-            ValueError: A shape is wrong; nothing has changed then.
+            KeyError: A field is missing; no field is changed.
+            ValueError: A shape is wrong; no field is changed.
         """
         self.set_rows(self.packed(values))

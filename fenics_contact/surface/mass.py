@@ -1,4 +1,4 @@
-"""Functions that are found by products with others: their right-hand sides, and the solver."""
+"""L2 projections: assembly of right-hand sides and the solver for mass matrices."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ __all__ = ["assembled", "mass_solver"]
 
 
 def assembled(form: fem.Form, vector: la.Vector | None = None) -> Array:
-    """Values of an assembled linear form, ghosts consistent. Collective.
+    """Assemble a linear form and return its values, ghosts updated. Collective.
 
     Args:
-        form: What to assemble.
-        vector: Where to, its values are overwritten; none: into a new one.
+        form: Compiled linear form.
+        vector: Vector that is overwritten; None: a new one.
     """
     with collective_errors(form.mesh.comm):
         if vector is None:
@@ -32,13 +32,13 @@ def assembled(form: fem.Form, vector: la.Vector | None = None) -> Array:
 def mass_solver(
     matrix: PETSc.Mat, *, rtol: float, atol: float | None = None, max_it: int | None = None
 ) -> PETSc.KSP:
-    """Conjugate gradients by the diagonal, which is all that a mass matrix needs. Collective.
+    """Create a Jacobi-preconditioned conjugate gradient solver for a mass matrix. Collective.
 
     Args:
-        matrix: Symmetric and positive, or nearly so.
-        rtol: Residual that ends it, relative.
-        atol: Likewise, absolute; none: PETSc's own.
-        max_it: Iterations that end it; none: PETSc's own.
+        matrix: Symmetric positive definite matrix.
+        rtol: Relative tolerance of the residual.
+        atol: Absolute tolerance; None: PETSc's default.
+        max_it: Largest number of iterations; None: PETSc's default.
     """
     ksp = PETSc.KSP().create(matrix.comm)
     ksp.setOperators(matrix)

@@ -1,4 +1,4 @@
-"""Young's modulus by the height of the cells at Γc, the measure of contact's stiffness."""
+"""Young's modulus over cell height at Γc, the scale of the contact stiffness."""
 
 from __future__ import annotations
 
@@ -22,57 +22,50 @@ from fenics_contact.types import Array, Indices
 
 __all__ = ["cell_modulus", "modulus_over_height"]
 
-# Length over which E/h is smoothed, in facets.
-_SMOOTHING_FACETS = 4.0
+# Smoothing length of E/h relative to the facet size.
+_SMOOTHING_LENGTH_RATIO = 4.0
 
 
 def cell_modulus(
     bulk_tangent: ufl.Form, displacement: Displacement, weight: ufl.core.expr.Expr
 ) -> fem.Function:
-    """Young's modulus of every cell as the bulk form itself has it. Collective.
+    """Measure Young's modulus of every cell by the bulk form. Collective.
 
-    Two uniform gradients of the displacement are put into the form cell by cell: simple shear
-    u = (0, x, 0) gives G, stretch u = (0, y, 0) gives M = λ + 2G; then E = G (3M - 4G)/(M - G).
-    Exact for isotropic solids and plane strain; within some per cent for plane stress; the
-    stiffness along y for others.
+    The form is evaluated for two uniform gradients: simple shear u = (0, x, 0) gives G, stretch
+    u = (0, y, 0) gives M = λ + 2G, and E = G (3M - 4G)/(M - G). The result is exact for isotropic
+    solids in plane strain and 3D, and within some per cent in plane stress. For anisotropic solids
+    it is the stiffness along y; in mixed forms 3G, the modulus of an incompressible solid.
 
-    Only what the form makes of the gradient of u and of that of its test function counts. Terms in
-    u or v themselves (mass, foundation, damping by velocity) are no stiffness of the material and
-    are left out, whatever their size: E of a form with inertia is that of the form without. So are
-    second gradients, and u_r/r of axisymmetric forms, which both strains have none of. Damping by
-    strain rates is stiffness here, as in the tangent.
-
-    In a mixed form the stiffness of the volume is not that of displacements alone: E is 3 G, that
-    of an incompressible body.
+    Only terms in ∇u and ∇v count. Terms in u or v (inertia, foundation, viscous drag), second
+    gradients and u_r/r of axisymmetric forms are excluded; strain-rate damping is included.
 
     Args:
-        bulk_tangent: Bilinear form of the bulk, by (trial, test) of what is solved for, its
-            derivatives expanded.
-        displacement: In it, where a nonlinear bulk is linearised.
-        weight: Factor of the volume measure that the bulk form carries (thickness, 2πr).
+        bulk_tangent: Bilinear form of the bulk in all unknowns, its derivatives expanded.
+        displacement: Displacement at which a nonlinear bulk is linearised.
+        weight: Factor of the volume measure in the bulk form (thickness, 2πr).
 
     Returns:
-        A function, one value per cell (stress).
+        Function with one value per cell (stress).
     """
     mesh, (test, trial) = displacement.u.function_space.mesh, bulk_tangent.arguments()
     modulus = fem.Function(fem.functionspace(mesh, ("DG", 0)), name="modulus")
-    two = fem.functionspace(mesh, ("DG", 0, (2,)))
-    q, cells = ufl.TestFunction(two), ufl.Form(bulk_tangent.integrals_by_type("cell"))
-    both = ufl.Form([])
+    pair_space = fem.functionspace(mesh, ("DG", 0, (2,)))
+    q, cells = ufl.TestFunction(pair_space), ufl.Form(bulk_tangent.integrals_by_type("cell"))
+    probes = ufl.Form([])
     for direction in range(2):
         gradient = np.zeros((*test.ufl_shape, mesh.geometry.dim))
         gradient[displacement.first + 1, direction] = 1.0
         uniform = ufl.as_tensor(gradient.tolist())
         strained = {ufl.grad(test): q[direction] * uniform, ufl.grad(trial): uniform}
-        rest = {argument: ufl.zero(argument.ufl_shape) for argument in (test, trial)}
-        both += ufl.replace(cells, strained | rest)
-    if both.empty():
+        zeros = {argument: ufl.zero(argument.ufl_shape) for argument in (test, trial)}
+        probes += ufl.replace(cells, strained | zeros)
+    if probes.empty():
         return modulus
-    # A form of its own: one with data of subdomains, as the user's may be, takes no other measures.
+    # A separate form: the subdomain data of the bulk form exclude other measures.
     volume = assembled(compile_form(weight * ufl.TestFunction(modulus.function_space) * ufl.dx))
-    energies = np.sum([assembled(part) for part in compile_by_rule(both)], axis=0)
+    energies = np.sum([assembled(part) for part in compile_by_rule(probes)], axis=0)
     shear, stretch = energies.reshape(-1, 2).T / volume
-    isotropic = stretch > 1.2 * shear  # λ > -0.8 G: else no isotropic solid, and E is the stretch's
+    isotropic = stretch > 1.2 * shear  # λ > -0.8 G, as in all isotropic solids
     if displacement.mixed:
         modulus.x.array[:] = 3 * shear
         return modulus
@@ -85,43 +78,38 @@ def cell_modulus(
 def modulus_over_height(
     surface: ContactSurface, modulus: fem.Function, opposite: Indices | None = None
 ) -> fem.Function:
-    """E/h over Γc, h the height of the cell over the facet, smoothed over a few facets. Collective.
+    """Compute E/h on Γc, with h the height of the cell over the facet, smoothed. Collective.
 
-    Between two bodies E is that of the softer one, which contact is to be stiff for; by the other's
-    it may be as stiff as 1e6 E/h of this one.
-
-    The smoothing matters: where a penalty jumps from facet to facet, so does the penetration, and
-    the body answers with pressure oscillations (10 % on an unstructured mesh of the half-cylinder,
-    whatever the penalty). It acts on the logarithm, so that the result is positive and a change of
-    units changes nothing else.
+    Between two bodies E is bounded by the largest modulus of the opposing one. A penalty that jumps
+    between facets causes pressure oscillations, of 10 % on an unstructured mesh of the
+    half-cylinder. Smoothing the logarithm keeps the result positive and independent of units.
 
     Args:
         surface: Γc.
         modulus: Young's modulus, one value per cell of the mesh (stress).
-        opposite: This rank's facets of the opposite surface, whose largest modulus bounds E; none:
-            the obstacle is rigid.
+        opposite: This rank's facets of the opposing surface; None: the obstacle is rigid.
 
     Returns:
         A continuous function of degree 1 on the submesh of Γc (stress/length).
 
     Raises:
-        ValueError: The modulus is not positive at some facet: the bulk form has no stiffness there.
+        ValueError: The modulus is not positive at a facet: the bulk form has no stiffness there.
     """
     mesh, submesh = surface.mesh, surface.submesh
-    behind = facet_cells(mesh, surface.parent_facets())
-    area = _sizes(submesh, np.arange(behind.size, dtype=np.int32))
-    # A simplex of height h over a facet of area A has the volume A h / d, a brick A h.
+    facet_cell = facet_cells(mesh, surface.parent_facets())
+    area = _sizes(submesh, np.arange(facet_cell.size, dtype=np.int32))
+    # The volume of a simplex is A h / d, that of a hexahedron A h.
     simplex = mesh.topology.cell_type in (
         dolfinx.mesh.CellType.triangle,
         dolfinx.mesh.CellType.tetrahedron,
     )
-    height = (mesh.topology.dim if simplex else 1) * _sizes(mesh, behind) / area
+    height = (mesh.topology.dim if simplex else 1) * _sizes(mesh, facet_cell) / area
     values, cells = modulus.x.array, modulus.function_space.dofmap.list[:, 0]
-    present = values[cells[behind]]
+    facet_modulus = values[cells[facet_cell]]
     if opposite is not None:
         stiffest = global_max(mesh.comm, values[cells[facet_cells(mesh, opposite)]], empty=np.inf)
-        present = np.minimum(present, stiffest)
-    ratio = present / height
+        facet_modulus = np.minimum(facet_modulus, stiffest)
+    ratio = facet_modulus / height
     smallest = global_min(mesh.comm, ratio, empty=1.0)
     if not smallest > 0.0:
         raise ValueError(
@@ -131,9 +119,9 @@ def modulus_over_height(
         )
     facets = fem.functionspace(submesh, ("DG", 0))
     logarithm, length = fem.Function(facets), fem.Function(facets)
-    own = facets.dofmap.list[: behind.size, 0]
-    logarithm.x.array[own] = np.log(ratio)
-    length.x.array[own] = _SMOOTHING_FACETS * area ** (1 / submesh.topology.dim)
+    dofs = facets.dofmap.list[: facet_cell.size, 0]
+    logarithm.x.array[dofs] = np.log(ratio)
+    length.x.array[dofs] = _SMOOTHING_LENGTH_RATIO * area ** (1 / submesh.topology.dim)
     for function in (logarithm, length):
         function.x.scatter_forward()
     result = _smooth(logarithm, length)
@@ -142,7 +130,7 @@ def modulus_over_height(
 
 
 def _sizes(mesh: dolfinx.mesh.Mesh, cells: npt.NDArray[np.integer[Any]]) -> Array:
-    """Area or volume of cells, that of their midpoints' Jacobian: exact for straight simplices."""
+    """Return areas or volumes of cells by the Jacobian at the midpoint, exact for affine ones."""
     kind = basix.CellType[mesh.topology.cell_name()]
     middle = basix.geometry(kind).mean(axis=0, keepdims=True)
     slopes = compat.geometry_element(mesh).tabulate(1, middle)[1:, 0, :, 0]
@@ -153,7 +141,7 @@ def _sizes(mesh: dolfinx.mesh.Mesh, cells: npt.NDArray[np.integer[Any]]) -> Arra
 
 
 def _smooth(values: fem.Function, length: fem.Function) -> fem.Function:
-    """Solve w - ∇·(length² ∇w) = values with free edges, w continuous of degree 1. Collective."""
+    """Solve w - ∇·(length² ∇w) = values with natural boundary conditions. Collective."""
     mesh = values.function_space.mesh
     space = fem.functionspace(mesh, ("Lagrange", 1))
     w, v = ufl.TrialFunction(space), ufl.TestFunction(space)
