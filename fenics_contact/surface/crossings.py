@@ -11,7 +11,7 @@ from numpy.polynomial.polynomial import polyval
 
 from fenics_contact.parallel import gather_rows, global_max, global_min
 from fenics_contact.surface.facets import across
-from fenics_contact.surface.projection import near_pairs
+from fenics_contact.surface.projection import find_near_pairs
 from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Index, Mask
 
@@ -179,10 +179,10 @@ def _find_candidates(
     longest, widest = radius[finite].max(), reach.max()
     if np.mean((reach + longest) ** (d - 1)) < np.mean((radius[finite] + widest) ** (d - 1)):
         tree = scipy.spatial.cKDTree(centre[finite])
-        facet, place = near_pairs(tree, middle, reach + longest)
+        facet, place = find_near_pairs(tree, middle, reach + longest)
     else:
         tree = scipy.spatial.cKDTree(middle)
-        place, facet = near_pairs(tree, centre[finite], radius[finite] + widest)
+        place, facet = find_near_pairs(tree, centre[finite], radius[finite] + widest)
     place = finite[place]
     near = np.linalg.norm(centre[place] - middle[facet], axis=1) <= radius[place] + reach[facet]
     near &= ~(vertices[place][:, :, None] == facets.vertices[facet][:, None, :]).any(axis=(1, 2))

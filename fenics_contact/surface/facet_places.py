@@ -11,7 +11,7 @@ from dolfinx import fem
 from fenics_contact.compat import geometry_element
 from fenics_contact.surface.crossings import MovingFacets
 from fenics_contact.surface.facets import FacetSet, tabulate
-from fenics_contact.surface.projection import polynomials
+from fenics_contact.surface.projection import polynomial_space
 from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.types import Array, Index
 
@@ -54,7 +54,7 @@ class FacetPlaces:
         )
         self._nodes = self.facets.combine(self._element.points)
         # The degree is limited to that of geometry and displacement: more points are fitted.
-        basis = polynomials(self.facets.kind, min(n_points, self._element.dim))
+        basis = polynomial_space(self.facets.kind, min(n_points, self._element.dim))
         table = tabulate(basis, 0, at)[0, :, :, 0].reshape(n_facets, n_points, basis.dim)
         self._fit = tabulate(basis, 0, self._element.points)[0, :, :, 0] @ np.linalg.pinv(table)
         self.points_carry_nodes = basis.dim == self._element.dim

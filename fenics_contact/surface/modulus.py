@@ -49,8 +49,8 @@ def cell_modulus(
     """
     mesh, (test, trial) = displacement.u.function_space.mesh, bulk_tangent.arguments()
     modulus = fem.Function(fem.functionspace(mesh, ("DG", 0)), name="modulus")
-    pair_space = fem.functionspace(mesh, ("DG", 0, (2,)))
-    q, cells = ufl.TestFunction(pair_space), ufl.Form(bulk_tangent.integrals_by_type("cell"))
+    vector_space = fem.functionspace(mesh, ("DG", 0, (2,)))
+    q, cells = ufl.TestFunction(vector_space), ufl.Form(bulk_tangent.integrals_by_type("cell"))
     probes = ufl.Form([])
     for direction in range(2):
         gradient = np.zeros((*test.ufl_shape, mesh.geometry.dim))

@@ -30,9 +30,9 @@ from fenics_contact.surface.facets import tabulate
 from fenics_contact.surface.projection import (
     cut_lines,
     cut_polygons,
-    facing_pairs,
-    near_pairs,
-    polynomials,
+    find_facing_pairs,
+    find_near_pairs,
+    polynomial_space,
 )
 from fenics_contact.surface.rays import BEHIND, Hits, Rays
 from fenics_contact.surface.surface import SurfaceQuadrature
@@ -196,7 +196,7 @@ class Pairing:
         (one, reach), (other, size) = ([gather_rows(comm, v) for v in ball] for ball in balls)
         reach = reach + max(2 * depth, self._obstacle.max_initial_penetration or 0.0)
         tree = scipy.spatial.cKDTree(other)
-        here, there = near_pairs(tree, one, reach + size.max(initial=0.0))
+        here, there = find_near_pairs(tree, one, reach + size.max(initial=0.0))
         close = np.linalg.norm(one[here] - other[there], axis=1) <= reach[here] + size[there]
         found = []
         for side, number in zip(self._sides, (here[close], there[close]), strict=True):
@@ -313,7 +313,7 @@ class Pairing:
         """L2 projection, facet by facet, from the pieces' points to the quadrature points."""
         d = self._d
         rows = self._quadrature.point_rows
-        basis = polynomials(self._here.kind, rows.shape[1])
+        basis = polynomial_space(self._here.kind, rows.shape[1])
         order = np.argsort(facet, kind="stable")
         bounds = np.searchsorted(facet[order], np.arange(len(rows) + 1))
         at_points = tabulate(basis, 0, place)[0, :, :, 0]
@@ -360,7 +360,7 @@ class Pairing:
         looks = gather_rows(self._comm, self._there.mean_normals())
         mean = here.mean_normals()
         cut = cut_lines if d == 2 else cut_polygons
-        pairs = facing_pairs(moved_here, mean, there, looks, away)
+        pairs = find_facing_pairs(moved_here, mean, there, looks, away)
         facet, other, points, weights, share = cut(moved_here, mean, there, pairs, self._degree())
         return facet, other, here.locate(facet, points, u), weights, share
 
@@ -374,6 +374,6 @@ class Pairing:
         found = self._quadrature.degree + degree
         if self._d == 3 and not self._here.simplex:
             n_points = self._quadrature.point_rows.shape[1]
-            own = polynomials(self._here.kind, n_points).degree
+            own = polynomial_space(self._here.kind, n_points).degree
             found = max(found, 2 * (own + max(own, degree)))
         return int(found)
