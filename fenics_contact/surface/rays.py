@@ -1,8 +1,7 @@
-"""Rays from Γc to what lies opposite, or back, on any number of ranks.
+"""Ray tracing between Γc and an opposing surface, distributed over the ranks.
 
-A normal meets many a surface, in front of the point and behind it: the other side of a plate, the
-next but one of a pile of leaves. What lies behind is opposite only where the bodies penetrate each
-other, and so only up to the depth that they may (`Admission`).
+A normal may hit several surfaces, in front of the point and behind it. Hits behind it are
+admissible only up to a bound of the penetration.
 """
 
 from __future__ import annotations
@@ -28,41 +27,39 @@ from fenics_contact.types import Array, Index
 __all__ = ["BEHIND", "REASONS", "Hits", "Partner", "Rays", "Side", "interpolation_matrix"]
 
 
-# Of the height of a cell: how far behind its facet another one of its own body may lie (initial
-# interference of a body with itself), and one whose cell shares a node with it (the lips of a
-# slit, meshed differently).
-_OWN, _JOINED = 0.5, 0.05
-# Angle between the normals of a facet and of the surface at its corner (radian), up to which the
-# facets stand for a smooth surface.
-_SMOOTH = 0.5
-# Why a point has no opposite, the likeliest last.
-_NOTHING, _FAR, BEHIND, _ITSELF = range(4)
+# Admissible penetration in self-contact relative to the cell height: in general, and for cells that
+# share a node, such as at the tip of a slit.
+_SELF_PENETRATION_RATIO, _SLIT_PENETRATION_RATIO = 0.5, 0.05
+# Largest angle between the normals of a facet and of a smooth surface at its corners (radians).
+_MAX_SMOOTH_ANGLE = 0.5
+# Reasons for unpaired points, in ascending priority.
+_NO_HIT, _TOO_FAR, BEHIND, _OWN_BODY = range(4)
 REASONS = {
-    _NOTHING: "their normals do not meet the opposite surface",
-    _FAR: "the opposite point is farther than search_distance",
+    _NO_HIT: "their normals do not meet the opposite surface",
+    _TOO_FAR: "the opposite point is farther than search_distance",
     BEHIND: "the opposite point is behind them, deeper than max_initial_penetration",
-    _ITSELF: "the opposite point is on the back of their own body",
+    _OWN_BODY: "the opposite point is on the back of their own body",
 }
 
 
 class Side:
-    """One of two surfaces, and what is known on every rank of all its facets.
+    """One of two surfaces, with data of all its facets on every rank.
 
     The constructor is collective.
 
     Args:
-        body: Connected part of every node of this rank.
+        body: Connected component of every node of this rank.
 
     Attributes:
-        facets: Those of this rank.
-        first: Number of this rank's first facet among all.
-        own: The numbers of this rank's facets among all.
-        height: Of every facet's cell over it, (n,) (length).
-        length: The longest distance between two corners of the undeformed facet, (n,).
-        body: Number of the connected part it bounds, (n,).
-        vertices: Of its cell, global, (n, n_vertices).
-        corners: Those of the facet, in their order around it, (n, n_corners).
-        middle: Of the undeformed facet, (n, d).
+        facets: Facets of this rank.
+        first: Global number of this rank's first facet.
+        own: Global numbers of this rank's facets.
+        height: Height of the cell over every facet, (n,) (length).
+        length: Largest distance between two corners of the undeformed facet, (n,) (length).
+        body: Number of the connected component, (n,).
+        vertices: Global vertex numbers of the cell, (n, n_vertices).
+        corners: Global vertex numbers of the facet in their order around it, (n, n_corners).
+        middle: Centre of the undeformed facet, (n, d) (length).
     """
 
     def __init__(self, facets: FacetSet, body: Any) -> None:
@@ -88,17 +85,17 @@ class Side:
 
     @cached_property
     def faceting(self) -> Array:
-        """How far from a smooth or a flat surface each of all facets may be (length). Collective.
+        """Faceting tolerance of all facets, (n,) (length). Collective.
 
-        Of the undeformed surface: twice the height of the arc over its chord, by the angles between
-        neighbours, and by those between the ends of a facet that is curved itself.
+        It is twice the height of the arc over its chord, by the angles between the undeformed
+        normals of neighbours and within curved facets.
         """
         facets = self.facets
         comm, d = facets.space.mesh.comm, facets.space.mesh.topology.dim
-        facet, place = facets.corners()
+        facet, xi = facets.corners()
         corners = facets.moved_corners(None)
         n, n_corners = corners.shape[:2]
-        normal = facets.normals(facet, place).reshape(n, n_corners + 1, d)[:, :-1]
+        normal = facets.normals(facet, xi).reshape(n, n_corners + 1, d)[:, :-1]
         size = np.linalg.norm(corners - corners.mean(axis=1)[:, None], axis=2).max(axis=1)
         flat = _angle(normal, facets.mean_normals()[:, None])
         normal, size, flat = (gather_rows(comm, values) for values in (normal, size, flat))
@@ -108,30 +105,29 @@ class Side:
         np.add.at(mean, number, normal)
         mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-300)
         angle = _angle(mean[number], normal)
-        angle[angle > _SMOOTH] = 0.0
-        slack: Array = size * np.maximum(angle, flat).max(axis=1)
-        return slack
+        angle[angle > _MAX_SMOOTH_ANGLE] = 0.0
+        tolerance: Array = size * np.maximum(angle, flat).max(axis=1)
+        return tolerance
 
 
-class _Admission:
-    """Which of what a point's normal meets is opposite it, see `DeformableBody`.
+class _Admissibility:
+    """Rule that selects the admissible hits of rays.
 
-    All that is in front may be. Behind the point the other body may lie as deep as the larger of
-    the two cells there is high, for no body is thinner than that; another facet of the point's own
-    body half as deep, or if it lay in front before the bodies deformed. Facets whose cells share a
-    node are opposite only where the body is notched or slit between them: at an edge or a tip they
-    have the body between them.
+    All hits in front are admissible. Behind the point, hits on another body are admissible up to
+    the height of the higher cell; hits on the point's own body up to half of it, or if they were in
+    front in the undeformed configuration. Facets whose cells share a node are admissible only at a
+    notch or slit, not at an edge or a tip.
 
     Args:
-        obstacle: Bounds.
-        sides: That of the points, and the one that is searched.
-        facet: Of every point, its number among those of all ranks, (n,).
-        undeformed: The points without displacement, (n, d).
-        normal: The way to what is in front of them there, (n, d).
-        deep: How deep the bodies penetrate each other at each of all facets (length).
+        obstacle: Opposing body with its search bounds.
+        sides: Side of the points and side that is searched.
+        facet: Global facet number of every point, (n,).
+        undeformed: Undeformed points, (n, d).
+        normal: Unit normals of the undeformed surface, (n, d).
+        penetration_bound: Penetration at each of all facets (length).
 
     Attributes:
-        reason: Why what was met does not count, the most telling of all, (n,).
+        reason: Reason for the rejection of hits, of the highest priority, (n,).
     """
 
     def __init__(
@@ -141,54 +137,54 @@ class _Admission:
         facet: Any,
         undeformed: Array,
         normal: Array,
-        deep: Array,
+        penetration_bound: Array,
     ) -> None:
         self._obstacle, (self._from, self._to), self._facet = obstacle, sides, facet
-        self._x, self._normal, self._deep = undeformed, normal, deep
-        self.reason = np.full(len(normal), _NOTHING)
+        self._x, self._normal, self._penetration_bound = undeformed, normal, penetration_bound
+        self.reason = np.full(len(normal), _NO_HIT)
 
-    def __call__(self, point: Any, facet: Any, place: Array, distance: Array) -> Any:
-        """Which hits count."""
-        one, other, release = self._from, self._to, self._obstacle.max_initial_penetration
-        here, there = self._facet[point], facet + other.first
-        height = one.height[here]
+    def __call__(self, point: Any, facet: Any, xi: Array, distance: Array) -> Any:
+        """Return which hits are admissible."""
+        one, other, limit = self._from, self._to, self._obstacle.max_initial_penetration
+        source, target = self._facet[point], facet + other.first
+        height = one.height[source]
         near = np.abs(distance) <= self._obstacle.search_distance
-        depth = np.maximum(height, other.height[there]) if release is None else release
-        # What touches lies behind by round-off as often as in front.
-        depth = np.maximum(depth, 2 * self._deep[here]) + NEGLIGIBLE * height
-        ahead = distance >= -depth
-        foreign = one.body[here] != other.body[there]
-        same = np.flatnonzero(~foreign)
+        depth = np.maximum(height, other.height[target]) if limit is None else limit
+        # Points in contact may be behind by round-off.
+        depth = np.maximum(depth, 2 * self._penetration_bound[source]) + NEGLIGIBLE * height
+        within_bound = distance >= -depth
+        opposing = one.body[source] != other.body[target]
+        same = np.flatnonzero(~opposing)
         if len(same):
             x, normal = self._x[point[same]], self._normal[point[same]]
-            h, there = height[same], there[same]
-            ends = one.vertices[here[same]][:, :, None] == other.vertices[there][:, None, :]
-            joined = ends.any(axis=(1, 2))
-            met, _ = other.facets.positions(facet[same], place[same])
-            start = np.einsum("qd,qd->q", met - x, normal)
-            middle = np.einsum("qd,qd->q", other.middle[there] - x, normal)
-            own = _OWN * h if release is None else release
-            foreign[same] = np.where(
+            h, target = height[same], target[same]
+            shared = one.vertices[source[same]][:, :, None] == other.vertices[target][:, None, :]
+            joined = shared.any(axis=(1, 2))
+            hit, _ = other.facets.positions(facet[same], xi[same])
+            start = np.einsum("qd,qd->q", hit - x, normal)
+            middle = np.einsum("qd,qd->q", other.middle[target] - x, normal)
+            own = _SELF_PENETRATION_RATIO * h if limit is None else limit
+            opposing[same] = np.where(
                 joined,
-                np.minimum(start, middle) >= -_JOINED * h,
+                np.minimum(start, middle) >= -_SLIT_PENETRATION_RATIO * h,
                 np.maximum(start, distance[same]) >= -own,
             )
-        reason = np.where(~foreign, _ITSELF, np.where(~ahead, BEHIND, _FAR))
-        counts = near & ahead & foreign
-        np.maximum.at(self.reason, point[~counts], reason[~counts])
-        return counts
+        reason = np.where(~opposing, _OWN_BODY, np.where(~within_bound, BEHIND, _TOO_FAR))
+        admissible = near & within_bound & opposing
+        np.maximum.at(self.reason, point[~admissible], reason[~admissible])
+        return admissible
 
 
 @dataclass(frozen=True)
 class Partner:
-    """What moves with the places met, (n, …); zeros where nothing was.
+    """Interpolation and geometry at the hits, (n, …); zero without a hit.
 
     Attributes:
-        nodes: Of the displacement there, global numbers, (n, n_basis).
-        weights: Of the nodes, and their derivatives by the facet's coordinates, (n, d, n_basis).
-        tangents: Of the displaced surface by these, (n, d, d - 1) (length).
-        before: The place in the bodies as they were displaced before, (n, d) (length).
-        tangents_before: Likewise, (n, d, d - 1).
+        nodes: Global numbers of the displacement nodes, (n, n_basis).
+        weights: Basis functions and their derivatives by ξ, (n, d, n_basis).
+        tangents: Tangents ∂x/∂ξ of the displaced surface, (n, d, d - 1) (length).
+        before: Position at an earlier displacement, (n, d) (length).
+        tangents_before: Tangents at the earlier displacement, (n, d, d - 1) (length).
     """
 
     nodes: Index
@@ -200,14 +196,15 @@ class Partner:
 
 @dataclass(frozen=True)
 class Hits:
-    """What rays meet.
+    """Hits of rays on a surface.
 
     Attributes:
-        place: In the undeformed body, (n, d); NaN where nothing was met.
-        distance: Along the ray, in the bodies as they were searched, (n,); likewise.
-        facet: Among those of all ranks, (n,), or -1.
-        reason: Why what else was met does not count, (n,).
-        partner: What moves with it.
+        place: Undeformed position of the hit, (n, d) (length); NaN without a hit.
+        distance: Signed distance along the ray at the displacement of the search, (n,) (length);
+            NaN without a hit.
+        facet: Global facet number, or -1, (n,).
+        reason: Reason for the rejection of other hits, (n,).
+        partner: Interpolation and geometry at the hits.
     """
 
     place: Array
@@ -217,45 +214,40 @@ class Hits:
     partner: Partner
 
     def completed(self, rows: Index, others: Hits) -> Hits:
-        """Return these hits with those of some rays replaced.
+        """Return the hits with ``rows``, (m,), replaced by ``others``, (m, …)."""
 
-        Args:
-            rows: Which ones, (m,).
-            others: The hits of these, (m, …).
-        """
-
-        def completed(mine: Any, theirs: Any) -> Any:
+        def replace(mine: Any, theirs: Any) -> Any:
             if isinstance(mine, Hits | Partner):
                 names = [f.name for f in fields(mine)]
                 pairs = {name: (getattr(mine, name), getattr(theirs, name)) for name in names}
-                return type(mine)(**{name: completed(*pair) for name, pair in pairs.items()})
+                return type(mine)(**{name: replace(*pair) for name, pair in pairs.items()})
             values = mine.copy()
             values[rows] = theirs
             return values
 
-        found: Hits = completed(self, others)
-        return found
+        replaced: Hits = replace(self, others)
+        return replaced
 
     def matrix(self, space: fem.FunctionSpace) -> PETSc.Mat:
-        """Displacements of the places met, (d n, n_dofs); empty rows elsewhere. Collective."""
-        met = np.flatnonzero(self.facet >= 0)
-        nodes, weights = self.partner.nodes[met], self.partner.weights[met, 0]
-        return interpolation_matrix(space, len(self.facet), met, nodes, weights)
+        """Return the interpolation matrix of the hits, (d n, n_dofs), else zero. Collective."""
+        rows = np.flatnonzero(self.facet >= 0)
+        nodes, weights = self.partner.nodes[rows], self.partner.weights[rows, 0]
+        return interpolation_matrix(space, len(self.facet), rows, nodes, weights)
 
 
 class Rays:
-    """Two surfaces that may touch, and what rays from one of them meet of the other.
+    """Ray tracing between two surfaces that may come into contact.
 
-    The constructor is collective, and collects both surfaces.
+    The constructor is collective, and gathers both surfaces.
 
     Attributes:
-        here: Γc, `Side`.
-        there: The opposite surface.
-        body: Connected part of every node of this rank.
-        facet: Facet of Γc of every owned point, among those of this rank, (n_points,).
+        here: Slave side, Γc.
+        there: Master side, the opposing surface.
+        body: Connected component of every node of this rank.
+        facet: Local facet of Γc of every owned point, (n_points,).
 
     Raises:
-        ValueError: The opposite facets are no part of the boundary; see `ContactSurface`.
+        ValueError: The opposing facets are not a part of the boundary.
     """
 
     def __init__(
@@ -268,7 +260,6 @@ class Rays:
         _, self.body = connected_bodies(space)
         self.here = Side(FacetSet(space, quadrature.surface.facets), self.body)
         self.there = Side(FacetSet(space, opposite), self.body)
-        # The points of a facet are the dofs of a submesh cell.
         rows = quadrature.point_rows
         self.facet = np.empty(quadrature.n_points, dtype=np.int64)
         self.facet[rows.ravel()] = np.repeat(np.arange(len(rows)), rows.shape[1])
@@ -276,90 +267,90 @@ class Rays:
     def follow(
         self,
         facet: Index,
-        place: Array,
+        xi: Array,
         ray: Array,
         u: fem.Function | None,
-        deep: Array,
+        penetration_bound: Array,
         *,
         back: bool = False,
         undeformed: Array | None = None,
         before: fem.Function | None = None,
     ) -> Hits:
-        """Follow rays from places on Γc to the opposite, or back from there. Collective.
+        """Trace rays from Γc to the opposing surface, or back. Collective.
 
         Args:
-            facet: Of this rank, of every place, (n,).
-            place: Reference coordinates on it, (n, d - 1).
+            facet: Local facet of every origin, (n,).
+            xi: Reference coordinates on it, (n, d - 1).
             ray: Unit directions, (n, d).
-            u: Displacement of the bodies; none: they are undeformed.
-            deep: How deep they penetrate each other at each facet of all ranks (length).
-            back: From the opposite to Γc.
-            undeformed: The rays in the undeformed bodies, (n, d), where they are others.
-            before: An earlier displacement, in which partners are asked for as well.
+            u: Displacement of the bodies; None: undeformed.
+            penetration_bound: Penetration at each facet of all ranks (length).
+            back: Whether to trace from the opposing surface to Γc.
+            undeformed: Directions in the undeformed bodies, (n, d); None: ``ray``.
+            before: Earlier displacement at which the hits are evaluated, too.
         """
         comm = self._comm
         sides = (self.there, self.here) if back else (self.here, self.there)
         source, target = sides
-        x, _ = source.facets.positions(facet, place, u)
-        start, _ = (x, None) if u is None else source.facets.positions(facet, place)
-        counts = comm.allgather(len(x))
+        x, _ = source.facets.positions(facet, xi, u)
+        start, _ = (x, None) if u is None else source.facets.positions(facet, xi)
+        n_rays = comm.allgather(len(x))
         normal = ray if undeformed is None else undeformed
         sent = x, ray, start, normal, facet + source.first
         x, ray, start, normal, number = (
             np.concatenate(parts) for parts in zip(*comm.allgather(sent), strict=True)
         )
-        admission = _Admission(self._obstacle, sides, number, start, normal, deep)
-        hit, where, distance = target.facets.search(x, ray, u, admission)
-        comm.Allreduce(MPI.IN_PLACE, admission.reason, op=MPI.MAX)
-        # The nearest over the ranks is met; of equals the lowest rank's.
-        reached = np.array(comm.allgather(np.where(hit >= 0, np.abs(distance), np.inf)))
-        mine = (np.argmin(reached, axis=0) == comm.rank) & (hit >= 0)
-        starts = np.concatenate([[0], np.cumsum(counts)])
+        rule = _Admissibility(self._obstacle, sides, number, start, normal, penetration_bound)
+        hit, xi_hit, distance = target.facets.search(x, ray, u, rule)
+        comm.Allreduce(MPI.IN_PLACE, rule.reason, op=MPI.MAX)
+        # The nearest hit of all ranks counts, on the lowest rank if distances are equal.
+        distances = np.array(comm.allgather(np.where(hit >= 0, np.abs(distance), np.inf)))
+        nearest = (np.argmin(distances, axis=0) == comm.rank) & (hit >= 0)
+        offsets = np.concatenate([[0], np.cumsum(n_rays)])
         messages = []
         for rank in range(comm.size):
-            local = np.flatnonzero(mine[starts[rank] : starts[rank + 1]])
-            points = starts[rank] + local
-            known = self._known(target, hit[points], where[points], u, before)
-            messages.append((local, distance[points], *known))
+            local = np.flatnonzero(nearest[offsets[rank] : offsets[rank + 1]])
+            points = offsets[rank] + local
+            evaluated = self._evaluate_hits(target, hit[points], xi_hit[points], u, before)
+            messages.append((local, distance[points], *evaluated))
         received = zip(*comm.alltoall(messages), strict=True)
         local, *values = (np.concatenate(parts) for parts in received)
-        n = counts[comm.rank]
+        n = n_rays[comm.rank]
 
-        def spread(values: Any, empty: float) -> Any:
+        def scatter(values: Any, empty: float) -> Any:
             rows = np.full((n, *values.shape[1:]), empty, dtype=values.dtype)
             rows[local] = values
             return rows
 
-        distance, number, place, *partner = values
+        distance, number, position, *partner = values
         return Hits(
-            spread(place, np.nan),
-            spread(distance, np.nan),
-            spread(number, -1),
-            admission.reason[starts[comm.rank] : starts[comm.rank + 1]],
-            Partner(*(spread(v, 0) for v in partner)),
+            scatter(position, np.nan),
+            scatter(distance, np.nan),
+            scatter(number, -1),
+            rule.reason[offsets[comm.rank] : offsets[comm.rank + 1]],
+            Partner(*(scatter(v, 0) for v in partner)),
         )
 
     @staticmethod
-    def _known(
+    def _evaluate_hits(
         target: Side,
         facet: Index,
-        where: Array,
+        xi_hit: Array,
         u: fem.Function | None,
         before: fem.Function | None,
     ) -> tuple[Any, ...]:
-        """Number of facets met and place there, and the fields of `Partner`."""
+        """Return global facets and undeformed positions of hits, and the fields of `Partner`."""
         facets = target.facets
-        nodes, weights = facets.interpolation(facet, where)
-        place, _ = facets.positions(facet, where)
-        first = facet + target.first, place, nodes, weights
+        nodes, weights = facets.interpolation(facet, xi_hit)
+        position, _ = facets.positions(facet, xi_hit)
+        first = facet + target.first, position, nodes, weights
         if before is None:
             return *first, *(np.zeros((len(facet), 0)) for _ in range(3))
-        _, tangents = facets.positions(facet, where, u)
-        return *first, tangents, *facets.positions(facet, where, before)
+        _, tangents = facets.positions(facet, xi_hit, u)
+        return *first, tangents, *facets.positions(facet, xi_hit, before)
 
 
 def _angle(one: Array, other: Array) -> Array:
-    """Between unit vectors, by the chord: of its cosine half of the digits are lost."""
+    """Return the angle between unit vectors, by the chord, which is accurate for small angles."""
     chord = np.linalg.norm(one - other, axis=-1)
     return np.asarray(2 * np.arcsin(np.minimum(chord / 2, 1)), dtype=np.float64)
 
@@ -367,13 +358,13 @@ def _angle(one: Array, other: Array) -> Array:
 def interpolation_matrix(
     space: fem.FunctionSpace, n: int, rows: Any, nodes: Any, weights: Array
 ) -> PETSc.Mat:
-    """Displacements at ``n`` places of this rank, some of which are interpolated. Collective."""
+    """Build the interpolation matrix of ``n`` points, zero except in ``rows``. Collective."""
     d, bs = space.mesh.geometry.dim, space.dofmap.bs
     order = np.argsort(rows)
-    filled = np.zeros(n, dtype=np.int64)
-    filled[rows] = nodes.shape[1]
+    n_entries = np.zeros(n, dtype=np.int64)
+    n_entries[rows] = nodes.shape[1]
     columns = nodes[order][:, None, :] * bs + np.arange(d)[None, :, None]
     values = np.broadcast_to(weights[order][:, None, :], columns.shape)
-    pointers = np.concatenate([[0], np.cumsum(np.repeat(filled, d))])
+    pointers = np.concatenate([[0], np.cumsum(np.repeat(n_entries, d))])
     n_columns = space.dofmap.index_map.size_local * bs
     return sparse_matrix(space.mesh.comm, n_columns, pointers, columns.ravel(), values.ravel())
