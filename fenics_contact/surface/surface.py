@@ -1,4 +1,4 @@
-"""ContactSurface: the facets of Γc, their submesh, and the quadrature points that carry history."""
+"""The contact surface Γc: its facets, their submesh and the quadrature points."""
 
 from __future__ import annotations
 
@@ -36,40 +36,38 @@ __all__ = [
 ]
 
 _SCHEMES = ("default", "vertex")
-# A block of width 1 on facets of Γc in the plane, those opposite so many times as short: force by
-# p + 1 points on a facet of Γc over that by as many on each opposite one.
-#     2: 0.98, 3: 0.91, 4: 0.96, 5: 0.83, 10: 0.59, 40: 0.5; where points feel pieces of facets
-#     2: 0.99, 3: 0.97, 4: 1.01, 5: 1.00, 10: 0.61, 40: 0.54.
-_PIERCING = 6
-# Degree of the finest rule that is taken unasked, by dimension: 40 points on a facet in the plane,
-# 16 in space. There pairs that are integrated piece by piece take 0.6 ms for an opposite facet at
-# degree 2, 2 at 6 and 15 at 14.
+# Ratio of slave to master facet length from which on segmented pairs need a finer rule. Force of a
+# 2D block with p + 1 points per slave facet relative to that with as many per master facet, by
+# length ratio: 2: 0.98, 3: 0.91, 4: 0.96, 5: 0.83, 10: 0.59, 40: 0.5; with segmented integration
+# 2: 0.99, 3: 0.97, 4: 1.01, 5: 1.00, 10: 0.61, 40: 0.54.
+_REFINED_LENGTH_RATIO = 6
+# Largest default degree by dimension: 40 points per facet in 2D, 16 in 3D, where segmented pairs
+# take 0.6, 2 and 15 ms per master facet at degree 2, 6 and 14.
 FINEST_RULE = {2: 78, 3: 6}
-# Of one block on another in space, where points feel the opposite at themselves alone, force with
-# that rule over that with the finer side as Γc: by degree of the elements, and how many opposite
-# facets are as long as one of Γc, of which there are 1 and 2 x 2.
+# Largest number of master nodes per point along a slave facet without segmentation. Ratio of the
+# force between 3D blocks with that rule to that with the finer side as slave, by element degree and
+# length ratio, for 1 and 2 x 2 slave facets:
 #     hexahedra, 1:  5: 0.995 and 0.998, 6: 0.83 and 0.93, 7: 0.95 and 0.98, 8: 0.93 and 0.98;
 #     hexahedra, 2:  2: 0.98 and 0.99, 3: 0.74 and 0.87, 4: 0.88, 5: 0.79;
 #     tetrahedra, 1: 5: 0.993 and 0.997, 6: 0.97 and 0.99, 8: 0.93;
 #     tetrahedra, 2: 2: 1.00 and 1.00, 3: 0.97 and 0.99, 4: 0.91.
-# In the plane it is 0.997 or more up to 200 opposite facets, and pieces leave less than 1e-4.
+# In 2D it is at least 0.997 up to a ratio of 200; with segmentation the error is below 1e-4.
 _NODES_PER_POINT = 1.25
-# By how many times as many opposite facets as by their longest sides are along one of Γc where they
-# are narrow: right angles in triangles alone make it 1.7.
-_NARROW = 2.0
-# By how many times as many opposite facets under one of Γc as by the medians they are counted
-# there: less is found in meshes whose facets are meant to be alike.
-_GRADED = 1.5
-# Points of Γc along a rigid obstacle by its smallest radius, at least, times the degree of the
-# elements. A cylinder of radius R is pressed 0.3 R into rubber and slides; by facets of length
-# h, the force over that by 8 times as many points, and by how much it rises and falls there (8 and
-# 16 % by the facets themselves):
+# Increase of the length ratio above which the widths of anisotropic master facets decide; right
+# angles in triangles alone cause 1.7.
+_ANISOTROPY_RATIO = 2.0
+# Increase of the length ratio above which the local one decides; uniform meshes have less.
+_GRADING_RATIO = 1.5
+# Smallest number of points of Γc per smallest radius of a rigid obstacle, times the element degree.
+# A cylinder of radius R is pressed 0.3 R into rubber and slides. Ratio of the force to that with 8
+# times as many points, and its oscillation (8 and 16 % by the mesh), by facet length h and point
+# spacing in R:
 #     h = R:   1/2: 0.986 and 3 %, 1/3: 0.998 and 10 %, 1/4: 1.000 and 8 %;
 #     h = 2 R: 1: 0.82 and 37 %, 2/3: 0.96 and 27 %, 1/2: 0.99 and 17 %, 1/3: 1.000 and 16 %;
-# by multipliers at the nodes 0.68 at h = R, 0.91 at R / 2.
+# with nodal multipliers 0.68 at h = R and 0.91 at h = R / 2.
 POINTS_PER_RADIUS = 4
-# Of the squared cosine of the angle between normals: from here on facets are compared.
-_FACING = 0.5
+# Smallest squared cosine of the angle between the normals of facing facets.
+_MIN_FACING_COSINE_SQUARED = 0.5
 
 
 class ContactSurface:
@@ -115,8 +113,8 @@ class ContactSurface:
     ) -> None:
         if quadrature_scheme is not None and quadrature_scheme not in _SCHEMES:
             raise ValueError(f"quadrature_scheme is {quadrature_scheme!r}; use one of {_SCHEMES}")
-        whole = is_number(quadrature_degree) and isinstance(quadrature_degree, Integral)
-        if quadrature_degree is not None and not (whole and quadrature_degree >= 2):
+        is_integer = is_number(quadrature_degree) and isinstance(quadrature_degree, Integral)
+        if quadrature_degree is not None and not (is_integer and quadrature_degree >= 2):
             raise ValueError(
                 f"quadrature_degree is {quadrature_degree!r}; it must be an integer, at least 2: "
                 "a facet with one point can tilt about it into the obstacle without resistance"
@@ -129,9 +127,8 @@ class ContactSurface:
             mesh, self.facets
         )
         self._facet_tags = facet_tags
-        # All nodes, as a linear bulk is of all of them: compared they take a tenth of the time of a
-        # hash, and tell how far they were moved.
-        self._places = mesh.geometry.x.copy()
+        # Comparison takes a tenth of the time of a hash, and yields the distance.
+        self._coordinates = mesh.geometry.x.copy()
         self._ids = tuple(int(tag) for tag in np.unique(np.atleast_1d(np.asarray(tags))))
 
     def quadrature(
@@ -151,8 +148,8 @@ class ContactSurface:
                 point per node resolves the obstacle.
             opposite: This rank's facets of the opposing body, which the rule has to resolve; None:
                 a rigid obstacle.
-            pieces: Whether pairs are integrated piece by piece over the opposite facets. The rule
-                is then refined only from `_PIERCING` opposite facets per facet of Γc on.
+            pieces: Whether pairs are integrated over segments of the opposing facets. The rule is
+                then refined only from `_REFINED_LENGTH_RATIO` opposing facets per facet of Γc on.
             radius: Smallest radius of curvature of a rigid obstacle, which the rule has to resolve
                 (length).
         """
@@ -162,79 +159,77 @@ class ContactSurface:
             nodal = nodal and per_node <= 1
             wanted = 2 * (per_node * element_degree - 1)
             degree = max(degree, min(wanted, FINEST_RULE[self.mesh.geometry.dim]))
-        free = self.quadrature_degree is None and self.quadrature_scheme is None
-        scheme = "vertex" if nodal and free else self.quadrature_scheme or "default"
+        is_default = self.quadrature_degree is None and self.quadrature_scheme is None
+        scheme = "vertex" if nodal and is_default else self.quadrature_scheme or "default"
         sparse = None
         if opposite is not None and self.quadrature_degree is None:
             dim = self.mesh.geometry.dim
-            coarser = self._times_as_coarse(opposite, across=dim == 3 and not pieces)
-            if pieces and coarser < _PIERCING:
-                coarser = 1
-            wanted = coarser * (degree + 2) - 2
+            ratio = self._length_ratio(opposite, widths=dim == 3 and not pieces)
+            if pieces and ratio < _REFINED_LENGTH_RATIO:
+                ratio = 1
+            wanted = ratio * (degree + 2) - 2
             degree = max(degree, min(wanted, FINEST_RULE[dim]))
-            nodes_per_point = coarser * element_degree / (degree // 2 + 1)
-            few = dim == 3 and not pieces and nodes_per_point > _NODES_PER_POINT
-            if few and scheme == "default":
-                sparse = Sparse(coarser, wanted)
+            nodes_per_point = ratio * element_degree / (degree // 2 + 1)
+            is_sparse = dim == 3 and not pieces and nodes_per_point > _NODES_PER_POINT
+            if is_sparse and scheme == "default":
+                sparse = Sparse(ratio, wanted)
         return SurfaceQuadrature(self, degree, scheme, sparse)
 
     def _points_per_node(self, radius: float) -> int:
-        """Points along a facet of median length for a radius of the obstacle. Collective.
-
-        See `POINTS_PER_RADIUS`.
-        """
-        lengths = gather_rows(self.mesh.comm, self._spreads(self.facets)[:, 3:4])
+        """Return the points needed along a facet by `POINTS_PER_RADIUS`. Collective."""
+        lengths = gather_rows(self.mesh.comm, self._moments(self.facets)[:, 3:4])
         return int(np.ceil(POINTS_PER_RADIUS * np.median(lengths) / radius - NEGLIGIBLE))
 
-    def _times_as_coarse(self, opposite: Indices, *, across: bool) -> int:
-        """How many facets of the opposite surface are as long as one of Γc, at least 1. Collective.
+    def _length_ratio(self, opposite: Indices, *, widths: bool) -> int:
+        """Return the ratio of the facet lengths of Γc and of the opposing surface. Collective.
 
-        By the medians of both, in the undeformed bodies; or where they are most under one of Γc.
+        It is the ratio of the undeformed medians, or the largest local one, rounded, at least 1.
 
         Args:
-            opposite: This rank's.
-            across: Whether to count long and narrow ones across, in space.
+            opposite: This rank's facets of the opposing surface.
+            widths: Whether to compare the widths of anisotropic facets, in 3D.
         """
         comm = self.mesh.comm
-        sides = [gather_rows(comm, self._spreads(facets)) for facets in (self.facets, opposite)]
+        sides = [gather_rows(comm, self._moments(facets)) for facets in (self.facets, opposite)]
         if not all(map(len, sides)):
             return 1
         (middle, ours), (others, theirs) = ((side[:, :3], side[:, 3]) for side in sides)
-        times = float(np.median(ours) / np.median(theirs))
-        graded = _most_under_one(middle, ours, others, theirs)
-        times = graded if graded > _GRADED * times else times
-        if across:
-            wide = self._times_as_wide(*sides)
-            times = wide if wide > _NARROW * times else times
-        return max(1, round(times))
+        ratio = float(np.median(ours) / np.median(theirs))
+        local_ratio = _largest_local_ratio(middle, ours, others, theirs)
+        ratio = local_ratio if local_ratio > _GRADING_RATIO * ratio else ratio
+        if widths:
+            width_ratio = self._width_ratio(*sides)
+            ratio = width_ratio if width_ratio > _ANISOTROPY_RATIO * ratio else ratio
+        return max(1, round(ratio))
 
-    def _times_as_wide(self, here: Array, there: Array) -> float:
-        """How many opposite facets are as long as one of Γc where they are most, in space.
-
-        The median over Γc, of each with the facet that is closest to it.
+    def _width_ratio(self, slave: Array, master: Array) -> float:
+        """Return the median over Γc of the largest directional size ratio of facets in 3D.
 
         Args:
-            here: Of all ranks, `_spreads` of Γc.
-            there: Those of the opposite facets.
+            slave: `_moments` of Γc on all ranks.
+            master: `_moments` of the opposing surface on all ranks.
         """
         (middle, own), (others, theirs) = (
-            (rows[:, :3], rows[:, 4:].reshape(-1, 3, 3)) for rows in (here, there)
+            (rows[:, :3], rows[:, 4:].reshape(-1, 3, 3)) for rows in (slave, master)
         )
         _, closest = scipy.spatial.cKDTree(others).query(middle)
         (_, axes), (_, other_axes) = np.linalg.eigh(own), np.linalg.eigh(theirs)
         # The first axis is the normal.
-        facing = np.einsum("fi,fi->f", axes[:, :, 0], other_axes[closest, :, 0]) ** 2 > _FACING
+        facing = (
+            np.einsum("fi,fi->f", axes[:, :, 0], other_axes[closest, :, 0]) ** 2
+            > _MIN_FACING_COSINE_SQUARED
+        )
         if not facing.any():
             return 1.0
         plane = axes[facing, :, 1:]
-        spreads = own[facing], theirs[closest][facing]
-        ours, opposed = (np.einsum("fia,fij,fjb->fab", plane, m, plane) for m in spreads)
-        most = np.linalg.eigvals(np.linalg.solve(opposed, ours)).real.max(axis=1)
-        return float(np.sqrt(np.median(most)))
+        moments = own[facing], theirs[closest][facing]
+        ours, opposing = (np.einsum("fia,fij,fjb->fab", plane, m, plane) for m in moments)
+        largest = np.linalg.eigvals(np.linalg.solve(opposing, ours)).real.max(axis=1)
+        return float(np.sqrt(np.median(largest)))
 
-    def _spreads(self, facets: Indices) -> Array:
-        """Of facets middles, lengths, and Σ (x - middle)(x - middle)ᵀ over corners, (n, 13)."""
-        if not len(facets):  # for which DOLFINx ends in a segmentation fault
+    def _moments(self, facets: Indices) -> Array:
+        """Return facet centres c, lengths and Σ (x - c)(x - c)ᵀ over corners, (n, 13)."""
+        if not len(facets):  # mesh.h of DOLFINx crashes
             return np.zeros((0, 13))
         mesh, dim = self.mesh, self.mesh.topology.dim - 1
         facets = np.asarray(facets, dtype=np.int32)
@@ -242,22 +237,20 @@ class ContactSurface:
         corners = mesh.geometry.x[nodes.reshape(len(facets), -1)]
         middle = corners.mean(axis=1)
         arms = corners - middle[:, None]
-        spread = np.einsum("fki,fkj->fij", arms, arms)
-        return np.hstack([middle, mesh.h(dim, facets)[:, None], spread.reshape(-1, 9)])
+        moment = np.einsum("fki,fkj->fij", arms, arms)
+        return np.hstack([middle, mesh.h(dim, facets)[:, None], moment.reshape(-1, 9)])
 
     def check_places(self, name: str) -> None:
-        """Check that the nodes of the mesh have not been moved. Collective.
-
-        Points, weights, gaps and the tangent of a linear bulk are computed once.
+        """Check that mesh coordinates are unchanged, as geometry is computed once. Collective.
 
         Raises:
             ValueError: Nodes have been moved; raised on all ranks.
         """
         x, comm = self.mesh.geometry.x, self.mesh.comm
-        if comm.allreduce(int(not np.array_equal(x, self._places))):
-            way = global_max(comm, np.abs(x - self._places))
+        if comm.allreduce(int(not np.array_equal(x, self._coordinates))):
+            distance = global_max(comm, np.abs(x - self._coordinates))
             raise ValueError(
-                f"{name}: nodes of the mesh have been moved, by up to {way:g}, since its "
+                f"{name}: nodes of the mesh have been moved, by up to {distance:g}, since its "
                 "ContactSurface was created; do not move the mesh, displacements are in u (with "
                 'kinematics="finite" of any size), or create surface, contacts and problem again'
             )
@@ -270,7 +263,7 @@ class ContactSurface:
     def measure(self, degree: int, scheme: str = "default") -> ufl.Measure:
         """Return the surface measure of Γc with a quadrature rule."""
         metadata = {"quadrature_degree": degree, "quadrature_rule": scheme}
-        # The caller's own tags: forms on one mesh must agree in them to be added.
+        # The user's tags: forms can be added only if they have the same subdomain data.
         return ufl.Measure(
             "ds",
             domain=self.mesh,
@@ -283,11 +276,11 @@ class ContactSurface:
 def tagged_facets(
     mesh: dolfinx.mesh.Mesh, facet_tags: dolfinx.mesh.MeshTags, tags: int | Sequence[int]
 ) -> npt.NDArray[np.int32]:
-    """Owned exterior facets with the tags, ascending. Collective.
+    """Return owned exterior facets with the tags, ascending. Collective.
 
     Raises:
-        ValueError: Wrong dimension, tags of another mesh, a tag that no facet has, an interior
-            facet with the tag.
+        ValueError: The dimension is wrong, the tags are of another mesh, no facet has a tag, or an
+            interior facet has one.
     """
     check_instance("mesh", mesh, dolfinx.mesh.Mesh)
     check_instance("facet_tags", facet_tags, dolfinx.mesh.MeshTags)
@@ -341,7 +334,7 @@ class Sparse:
     """Insufficient resolution of the opposite facets by the quadrature points of Γc.
 
     Attributes:
-        times: Number of opposite facets along a facet of Γc.
+        times: Number of opposing facets along a facet of Γc.
         degree: Degree of a rule that would resolve them.
     """
 
@@ -354,22 +347,21 @@ class SurfaceQuadrature:
 
     Attributes:
         surface: The `ContactSurface`.
-        sparse: The insufficient resolution of a rule that was chosen by default, or None.
-        asked: Whether the user has chosen the rule.
+        sparse: Insufficient resolution of a default rule, or None.
+        asked: Whether the rule was chosen by the user.
         degree: Polynomial degree of the rule.
         ds: The measure of Γc with this rule.
-        at_vertices: Whether the points are those of the rule "vertex".
-        n_points: Quadrature points that this rank owns.
-        weights: Weight times surface Jacobian of the owned points, shape (n_points,), in
-            length^(gdim-1).
-        weights_with_ghosts: Those of all points that this rank knows.
+        at_vertices: Whether the rule is "vertex".
+        n_points: Number of quadrature points owned by this rank.
+        weights: Weight times surface Jacobian of the owned points, (n_points,) (length^(gdim-1)).
+        weights_with_ghosts: Weights including those of ghost points.
     """
 
     def __init__(
         self, surface: ContactSurface, degree: int, scheme: str, sparse: Sparse | None = None
     ) -> None:
         if scheme == "vertex":
-            degree = 1  # the rule of the vertices has no other
+            degree = 1
         self.surface, self.sparse = surface, sparse
         self.asked = surface.quadrature_degree is not None or surface.quadrature_scheme == "vertex"
         self.degree = degree
@@ -379,29 +371,29 @@ class SurfaceQuadrature:
         self._points_and_weights = _vertex_rule(self._cell) if self.at_vertices else None
         self._spaces: dict[int | None, fem.FunctionSpace] = {}
         space = self.space()
-        self.weights_with_ghosts = self._weigh(self.ds)
+        self.weights_with_ghosts = self._compute_weights(self.ds)
         self.n_points = space.dofmap.index_map.size_local
         self.weights = self.weights_with_ghosts[: self.n_points]
 
-    def _weigh(self, measure: ufl.Measure) -> Array:
-        """Weight times Jacobian of all points that this rank knows. Collective."""
+    def _compute_weights(self, measure: ufl.Measure) -> Array:
+        """Return weight times Jacobian of all points, ghosts included. Collective."""
         space = self.space()
         form = compile_form(ufl.TestFunction(space) * measure, self.surface.entity_maps)
         return assembled(form, la.vector(space.dofmap.index_map, 1))
 
     @cached_property
     def on_submesh(self) -> tuple[ufl.Measure, Array]:
-        """The measure of Γc as a mesh of its own, and `_weigh` by it. Collective."""
+        """Cell measure of the submesh and weights of all points. Collective."""
         measure = ufl.Measure("dx", self.surface.submesh, metadata=self.ds.metadata())
-        return measure, self._weigh(measure)
+        return measure, self._compute_weights(measure)
 
     @staticmethod
     def default_degree(element_degree: int) -> int:
-        """Return degree 2p, exact for the work of tractions of degree p on a closed facet."""
+        """Return degree 2p, exact for the work of tractions of degree p."""
         return 2 * max(1, element_degree)
 
     def space(self, size: int | None = None) -> fem.FunctionSpace:
-        """Space of functions at the points, scalar or with ``size`` components, made once."""
+        """Return the quadrature space, scalar or with ``size`` components, cached."""
         if size not in self._spaces:
             shape = () if size is None else (size,)
             points, weights = self._points_and_weights or (None, None)
@@ -418,30 +410,27 @@ class SurfaceQuadrature:
 
     @cached_property
     def point_rows(self) -> npt.NDArray[np.int32]:
-        """Points of every facet of this rank, (n_facets, n_points_per_facet).
-
-        Row i is that of ``surface.facets[i]``.
-        """
+        """Points of every facet of ``surface.facets``, (n_facets, n_points_per_facet)."""
         parents = self.surface.parent_facets()
         return self.space().dofmap.list[: parents.size][np.argsort(parents)]
 
     @cached_property
     def facet_sizes(self) -> Array:
-        """Length of the point's facet, in space the root of its area, (n_points,) (length)."""
+        """Length of the point's facet, in 3D the root of its area, (n_points,) (length)."""
         rows, sizes = self.point_rows, np.empty(self.n_points)
         areas = self.weights[rows].sum(axis=1)
         sizes[rows] = areas[:, None] ** (1.0 / (self.surface.mesh.geometry.dim - 1))
         return sizes
 
     def interpolation_matrix(self, space: fem.FunctionSpace) -> PETSc.Mat:
-        """Sparse matrix from the dofs of a function to its values at the points. Collective.
+        """Assemble the interpolation matrix from dofs to values at the points. Collective.
 
         Args:
-            space: On the mesh of the body or on the submesh; scalar (d = 1), or vector-valued with
-                block size d.
+            space: Scalar space (d = 1) or vector-valued space of block size d on the mesh or the
+                submesh.
 
         Returns:
-            Matrix with d rows per point, (d n_points, n_dofs).
+            Matrix, (d n_points, n_dofs).
         """
         scalar = not space.ufl_element().reference_value_shape
         values = self.space(None if scalar else space.dofmap.bs)
@@ -459,7 +448,7 @@ class SurfaceQuadrature:
 
 
 class VertexAreas:
-    """The area that each vertex of Γc stands for in the rule "vertex".
+    """Tributary areas of the vertices of Γc in the rule "vertex".
 
     The constructor is collective.
 
@@ -468,8 +457,8 @@ class VertexAreas:
         weight: Factor w of the surface measure.
 
     Attributes:
-        area: Continuous function of degree 1 on the submesh of Γc, ∫ w v ds with v the function of
-            the vertex (length^(gdim-1) times the unit of the weight).
+        area: Function of degree 1 on the submesh of Γc, ∫ w φ ds with φ the basis function of the
+            vertex (length^(gdim-1) times the unit of the weight).
 
     Raises:
         ValueError: The rule is another one, or an area is not positive.
@@ -495,7 +484,7 @@ class VertexAreas:
         self.update()
 
     def update(self) -> None:
-        """Measure again, with the weight as it is now. Collective.
+        """Recompute the areas with the present weight. Collective.
 
         Raises:
             ValueError: The area of a vertex is not positive.
@@ -511,19 +500,19 @@ class VertexAreas:
 
 
 class PointEvaluator:
-    """Evaluates named UFL expressions at the quadrature points of Γc, all in one compiled form.
+    """Evaluation of named UFL expressions at the quadrature points of Γc by one compiled form.
 
-    By assembly, ∫ e q ds / ∫ q ds with q the test function of the quadrature space: exact for any
-    orientation of the facets, which the evaluation of expressions on facets is not in every
-    release of DOLFINx. The constructor is collective, and compiles the form.
+    Values are ∫ e q ds / ∫ q ds with q the test function of the quadrature space. Unlike
+    `fem.Expression` on facets this is independent of their orientation in all releases of DOLFINx.
+    The constructor is collective, and compiles the form.
 
     Args:
         expressions: Scalars and vectors by name.
-        by_points: Whether they are of functions at the points and of nothing else: then the
-            form knows Γc alone, and is the same on all bodies with facets of this kind.
+        by_points: Whether the expressions contain quadrature functions only. The form is then
+            defined on the submesh, and compiled once per type of facet.
 
     Attributes:
-        form: What is assembled (UFL).
+        form: Assembled UFL form.
     """
 
     def __init__(
@@ -557,9 +546,9 @@ class PointEvaluator:
         self._n_owned = quadrature.n_points
 
     def __call__(self) -> dict[str, Array]:
-        """The values at the owned points by name, shape (n_points,) or (n_points, d). Collective.
+        """Return copies of the values at the owned points by name. Collective.
 
-        The arrays are copies.
+        Shapes are (n_points,) for scalars and (n_points, d) for vectors.
         """
         weighted = assembled(self._compiled, self._vector).reshape(-1, self._size)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -567,33 +556,34 @@ class PointEvaluator:
         return {name: values[: self._n_owned, c].copy() for name, c in self._columns.items()}
 
 
-def _most_under_one(middle: Array, ours: Array, others: Array, theirs: Array) -> float:
-    """How many facets opposite are as long as one of Γc, where they are most.
+def _largest_local_ratio(
+    centre: Array, length: Array, master_centre: Array, master_length: Array
+) -> float:
+    """Return the largest local length ratio of facets of Γc and opposing ones.
 
-    Under a facet are the one that is closest to it, and all to which it is the closest and that are
-    no farther from it than that by half of its length; their median counts, as one alone may be a
-    sliver.
+    A facet of Γc is compared with the median of its nearest opposing facet and of those to which it
+    is the nearest, if these are not farther away by more than half its length.
 
     Args:
-        middle: Of all facets of Γc, (n, 3) (length).
-        ours: Their lengths, (n,).
-        others: Middles opposite, (m, 3).
-        theirs: Their lengths, (m,).
+        centre: Centres of all facets of Γc, (n, 3) (length).
+        length: Their lengths, (n,).
+        master_centre: Centres of the opposing facets, (m, 3) (length).
+        master_length: Their lengths, (m,).
     """
-    nearest, first = scipy.spatial.cKDTree(others).query(middle)
-    distance, owner = scipy.spatial.cKDTree(middle).query(others)
-    under = distance <= nearest[owner] + ours[owner] / 2
-    facet = np.concatenate([np.arange(len(middle)), owner[under]])
-    other = np.concatenate([first, np.flatnonzero(under)])
+    nearest, first = scipy.spatial.cKDTree(master_centre).query(centre)
+    distance, owner = scipy.spatial.cKDTree(centre).query(master_centre)
+    is_near = distance <= nearest[owner] + length[owner] / 2
+    facet = np.concatenate([np.arange(len(centre)), owner[is_near]])
+    other = np.concatenate([first, np.flatnonzero(is_near)])
     facet, other = np.unique(np.column_stack([facet, other]), axis=0).T
-    order = np.lexsort((theirs[other], facet))
+    order = np.lexsort((master_length[other], facet))
     _, start, count = np.unique(facet, return_index=True, return_counts=True)
-    median = theirs[other[order]][start + (count - 1) // 2]
-    return float(np.max(ours / median))
+    median = master_length[other[order]][start + (count - 1) // 2]
+    return float(np.max(length / median))
 
 
 def _vertex_rule(cell: str) -> tuple[Array, Array]:
-    """Points and weights of the rule "vertex" as the form compiler has it."""
+    """Return points and weights of the rule "vertex" as defined by FFCx."""
     points = basix.geometry(basix.CellType[cell])
     volume = {"interval": 1.0, "triangle": 0.5, "quadrilateral": 1.0}[cell]
     return points, np.full(len(points), volume / len(points))
