@@ -1,8 +1,8 @@
-"""Obstacles: they return gap s and normal n at a point of Γc, as UFL or as numbers.
+"""Base classes of obstacles, which define gap s and normal n at a point of Γc.
 
-n points **from the body to the obstacle**; s is the gap along n, ≥ 0 where open. An obstacle is
-independent of the mesh: numbers become constants of the mesh through the function that is passed
-to `Obstacle.place`, so that a new value does not compile a new form.
+n points **from the body to the obstacle**; s is the gap along n, ≥ 0 where open. Obstacles are
+independent of the mesh: `Obstacle.place` receives a function that makes constants of numbers, so
+that new values do not compile new forms.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ __all__ = [
 
 ToUFL = Callable[[Any], ufl.core.expr.Expr]
 
-# A coordinate whose square does not overflow: a diverged state has points beyond.
+# Largest coordinate at which obstacles are evaluated; points of diverged states may be beyond.
 NOWHERE = 1e100
 
 
@@ -129,8 +129,8 @@ class Rotation:
         Raises:
             ValueError: ``axis`` is given in the plane, or missing in space.
         """
-        found = as_axis("axis of the Rotation", self.axis, gdim)
-        return np.array([0.0, 0.0, 1.0]) if found is None else np.asarray(found)
+        axis = as_axis("axis of the Rotation", self.axis, gdim)
+        return np.array([0.0, 0.0, 1.0]) if axis is None else np.asarray(axis)
 
     def matrix(self, gdim: int, angle: ufl.core.expr.Expr) -> ufl.core.expr.Expr:
         """Return the rotation matrix R, from initial to present directions, (gdim, gdim).
@@ -151,11 +151,11 @@ class Rotation:
         c, s = ufl.cos(angle), ufl.sin(angle)
         if gdim == 2:
             return ufl.as_matrix([[c, -s], [s, c]])
-        across = ufl.as_matrix([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        return ufl.Identity(3) + s * across + (1 - c) * ufl.dot(across, across)
+        skew = ufl.as_matrix([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        return ufl.Identity(3) + s * skew + (1 - c) * ufl.dot(skew, skew)
 
     def turned(self, vectors: Array, angle: float | Array) -> Array:
-        """Return vectors (n, gdim) rotated by one angle, or by one angle each (radians)."""
+        """Rotate vectors (n, gdim) by one angle, or by one angle each (radians)."""
         c, s = (np.reshape(f(angle), (-1, 1)) for f in (np.cos, np.sin))
         if self.axis is None:
             return np.asarray(c * vectors + s * self.rate(vectors))
@@ -164,7 +164,7 @@ class Rotation:
         return np.asarray(along + c * (vectors - along) + s * np.cross(axis, vectors))
 
     def rate(self, vectors: Array) -> Array:
-        """Return axis × vectors, the derivative of rotating vectors by the angle, (n, gdim)."""
+        """Return axis × vectors, the derivative of rotated vectors by the angle, (n, gdim)."""
         if vectors.shape[1] == 2:
             return np.column_stack([-vectors[:, 1], vectors[:, 0]])
         return np.asarray(np.cross(self.unit_axis(3), vectors), dtype=np.float64)
@@ -195,12 +195,12 @@ class Obstacle:
         """Check that a subclass defines `place`.
 
         Raises:
-            ValueError: It does not.
+            ValueError: `place` is not defined.
         """
-        self._check_said(Obstacle, place="its gap and direction, as UFL")
+        self._check_members(Obstacle, place="its gap and direction, as UFL")
 
-    def _check_said(self, abstract: type[Obstacle], **members: str) -> None:
-        """Check that a subclass overrides the abstract members of a class."""
+    def _check_members(self, abstract: type[Obstacle], **members: str) -> None:
+        """Check that a subclass overrides abstract members."""
         for member, meaning in members.items():
             if getattr(type(self), member) is getattr(abstract, member):
                 raise ValueError(
@@ -215,10 +215,7 @@ class Obstacle:
 
     @property
     def smallest_radius(self) -> float:
-        """Smallest radius of curvature of the convex parts (length).
-
-        It is infinite if there are none, or if the radius is not known as a number.
-        """
+        """Smallest convex radius of curvature (length); infinite if there is none or unknown."""
         return np.inf
 
     def place(self, x: ufl.core.expr.Expr, to_ufl: ToUFL) -> Placement:
@@ -236,17 +233,17 @@ class Obstacle:
         raise NotImplementedError
 
     def placed(self, x: ufl.core.expr.Expr, to_ufl: ToUFL) -> Placement:
-        """Return `place`, checked.
+        """Return the result of `place` after checking it.
 
         Raises:
-            ValueError: It fails, or does not return a gap and a direction of the mesh's dimension.
+            ValueError: `place` fails, or returns no gap and direction of the mesh's dimension.
         """
         name, d = f"{type(self).__name__}.place", x.ufl_shape[0]
         try:
             found = self.place(x, to_ufl)
             if isinstance(found, Placement):
                 found = Placement(ufl.as_ufl(found.gap), ufl.as_vector(found.direction))
-                ufl.as_ufl(found.normal)  # which a direction of zeros does not have
+                ufl.as_ufl(found.normal)  # fails for a zero direction
         except Exception as error:
             if is_built_in(self):
                 raise
@@ -295,9 +292,9 @@ class SampledObstacle(Obstacle):
         """Check that a subclass defines `gdim`, `fingerprint` and `sample`.
 
         Raises:
-            ValueError: It does not.
+            ValueError: One of them is not defined.
         """
-        self._check_said(
+        self._check_members(
             SampledObstacle,
             gdim="the dimension of space, 2 or 3",
             fingerprint="a string that identifies its data",
@@ -325,41 +322,41 @@ class SampledObstacle(Obstacle):
         raise NotImplementedError
 
     def sample_checked(self, x: Array) -> Sample:
-        """Return `sample` after checking shapes and values; NaN at points of a diverged state.
+        """Return `sample` after checking shapes and values; NaN beyond `NOWHERE`.
 
         Not collective.
 
         Raises:
             ValueError: An array has the wrong shape, or a distance or normal is not finite.
         """
-        there = np.abs(x).max(axis=1, initial=0.0) < NOWHERE
-        given = self.sample(x[there])
+        valid = np.abs(x).max(axis=1, initial=0.0) < NOWHERE
+        given = self.sample(x[valid])
         d, name = x.shape[1], type(self).__name__
-        n = int(np.count_nonzero(there))
+        n = int(np.count_nonzero(valid))
         shapes = {"distance": (n,), "normal": (n, d), "curvature": (n, d, d)}
         arrays = {}
-        for what, shape in shapes.items():
-            array = np.asarray(getattr(given, what), dtype=np.float64)
+        for field, shape in shapes.items():
+            array = np.asarray(getattr(given, field), dtype=np.float64)
             if array.shape != shape:
                 raise ValueError(
-                    f"{name}: {what} of its sample has shape {array.shape}; for {n} points in {d} "
+                    f"{name}: {field} of its sample has shape {array.shape}; for {n} points in {d} "
                     f"dimensions it must be {shape}"
                 )
-            if what != "curvature":  # a round obstacle has none at its centre
+            if field != "curvature":  # undefined at the centre of a ball
                 wrong = ~np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
                 if wrong.any():
                     raise ValueError(
-                        f"{name}: {what} of its sample is not finite at "
-                        f"{x[there][wrong][0].tolist()}; it must be finite at every point, however "
+                        f"{name}: {field} of its sample is not finite at "
+                        f"{x[valid][wrong][0].tolist()}; it must be finite at every point, however "
                         "far from the obstacle"
                     )
-            arrays[what] = np.full((len(x), *shape[1:]), np.nan)
-            arrays[what][there] = array
+            arrays[field] = np.full((len(x), *shape[1:]), np.nan)
+            arrays[field][valid] = array
         return Sample(**arrays)
 
 
 def as_vector(name: str, value: Any, gdim: int) -> Any:
-    """Check a point or direction given by numbers: ``gdim`` finite entries."""
+    """Check a point or direction: UFL, or ``gdim`` finite numbers."""
     if isinstance(value, ufl.core.expr.Expr):
         if value.ufl_shape != (gdim,):
             raise ValueError(f"{name} has shape {value.ufl_shape}; the mesh needs ({gdim},)")
@@ -371,19 +368,19 @@ def as_vector(name: str, value: Any, gdim: int) -> Any:
 
 
 def nonzero_vector(name: str, value: Any, gdim: int) -> Any:
-    """Check a direction given by numbers: not of length zero. Its length does not matter."""
+    """Check a direction and normalise it if it is given by numbers."""
     value = as_vector(name, value, gdim)
     if isinstance(value, np.ndarray):
         largest = np.abs(value).max()
         if largest == 0.0:
             raise ValueError(f"{name} is {value.tolist()}; it must not have length zero")
-        value = value / largest  # whose square neither overflows nor vanishes
+        value = value / largest  # avoids overflow of squares
         return value / np.linalg.norm(value)
     return value
 
 
 def as_axis(name: str, value: Any, gdim: int) -> Any:
-    """Check the direction of an axis: `nonzero_vector` in space, and None in the plane."""
+    """Check the direction of an axis: `nonzero_vector` in 3D, None in 2D."""
     if gdim == 2 and value is not None:
         raise ValueError(f"{name} is {value!r}; omit it in 2D")
     if gdim == 3 and value is None:
@@ -392,7 +389,7 @@ def as_axis(name: str, value: Any, gdim: int) -> Any:
 
 
 def as_positive(name: str, value: Any) -> Any:
-    """Check a length given by a number."""
+    """Check that a number is positive."""
     if not isinstance(value, ufl.core.expr.Expr):
         check_positive(name, value)
     return value

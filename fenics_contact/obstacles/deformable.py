@@ -1,4 +1,4 @@
-"""An opposing deformable body: its surface, and how pairs of points are found."""
+"""An opposing deformable body and the options of its pairing."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class DeformableBody(Obstacle):
             limit is twice the present penetration.
 
     Raises:
-        ValueError: A distance is negative or no number, or ``update_pairs`` is unknown.
+        ValueError: A distance is negative or not a number, or ``update_pairs`` is unknown.
     """
 
     facet_tags: dolfinx.mesh.MeshTags
