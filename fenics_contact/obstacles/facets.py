@@ -107,7 +107,7 @@ class Facets:
         reach = np.linalg.norm(x, axis=1)
         scale = _FAR_RATIO * self.size / np.maximum(reach, _FAR_RATIO * self.size)
         x, rest = scale[:, None] * x, (1.0 - scale) * reach
-        facet = self._search.closest(x, self._distance, _SAME_RATIO * self.size)
+        facet = self._search.find_closest(x, self._distance, _SAME_RATIO * self.size)
         projection, feature = self._project(x, facet)
         outward = self._normals[facet, feature]
         arm = x - projection

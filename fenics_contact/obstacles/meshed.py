@@ -58,8 +58,8 @@ class RigidSurface(SampledObstacle):
         corners = as_points("points of the RigidSurface", points)
         numbers = np.asarray(facets)
         d = corners.shape[1]
-        kind = numbers.dtype.kind in "iu"
-        if numbers.ndim != 2 or numbers.shape[1] != d or not len(numbers) or not kind:
+        integral = numbers.dtype.kind in "iu"
+        if numbers.ndim != 2 or numbers.shape[1] != d or not len(numbers) or not integral:
             raise ValueError(
                 f"facets of the RigidSurface are {numbers.dtype} of shape {numbers.shape}; they "
                 f"must be integers of shape (n_facets, {d}) with points in {d} dimensions"
@@ -69,8 +69,8 @@ class RigidSurface(SampledObstacle):
                 f"facets of the RigidSurface have indices from {numbers.min()} to {numbers.max()}; "
                 f"with {len(corners)} points they must be from 0 to {len(corners) - 1}"
             )
-        whole = is_number(halvings) and isinstance(halvings, Integral)
-        if not whole or halvings < 0 or (halvings and d == 2):
+        is_integer = is_number(halvings) and isinstance(halvings, Integral)
+        if not is_integer or halvings < 0 or (halvings and d == 2):
             raise ValueError(
                 f"halvings of the RigidSurface is {halvings!r}; it must be an integer, at least 0, "
                 "and 0 in the plane: use a RigidProfile for a smooth curve through points"

@@ -1,4 +1,4 @@
-"""Rigid obstacles whose surface is a smooth profile: in the plane, extruded or turned in space."""
+"""Rigid obstacles bounded by a smooth profile, in 3D extruded or revolved."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from fenics_contact.types import Array
 
 __all__ = ["RigidProfile"]
 
-# Of the size of the coordinates: distance from the axis that is none.
-_ON_AXIS = 1e-9
+# Largest distance of points on the axis relative to the coordinates.
+_AXIS_DISTANCE_RATIO = 1e-9
 
 
 class RigidProfile(SampledObstacle):
@@ -60,22 +60,22 @@ class RigidProfile(SampledObstacle):
         given = as_points("points of the RigidProfile", points)
         check_bool("closed of the RigidProfile", closed)
         self._gdim = given.shape[1]
-        ways = [v for v in (extruded, turned) if v is not None]
-        if len(ways) != self._gdim - 2:
+        options = [v for v in (extruded, turned) if v is not None]
+        if len(options) != self._gdim - 2:
             raise ValueError(
                 "a RigidProfile needs neither extruded nor turned with points in the plane, and "
                 f"one of them with points in space; it has points in {self._gdim} dimensions, "
                 f"extruded={extruded!r} and turned={turned!r}"
             )
-        self._section: _Prism | _Revolution | None = None
+        self._section: _Extrusion | _Revolution | None = None
         if extruded is not None:
-            self._section = _Prism(extruded)
+            self._section = _Extrusion(extruded)
         elif turned is not None:
             self._section = _Revolution(turned)
         if self._section is not None:
             given = self._section.plane(given)
         if isinstance(self._section, _Revolution) and not closed:
-            given, closed = _mirrored(given)
+            given, closed = _mirror_at_axis(given)
         if closed and np.array_equal(given[0], given[-1]):
             given = given[:-1]
         following = np.roll(given, -1, axis=0) if closed else given[1:]
@@ -87,7 +87,7 @@ class RigidProfile(SampledObstacle):
                 "distinct points, in their order on the surface"
             )
         self.curve = Curve(given, closed=closed)
-        ends = [a for way in ways for a in np.ravel(np.asarray(way, dtype=np.float64))]
+        ends = [a for option in options for a in np.ravel(np.asarray(option, dtype=np.float64))]
         self._fingerprint = fingerprint_of(given, np.array([float(closed), *ends]))
         self.displacement, self.rotation = displacement, rotation
 
@@ -110,32 +110,32 @@ class RigidProfile(SampledObstacle):
         """Return signed distance, normal and curvature at points (n, gdim)."""
         if self._section is None:
             return self.curve.sample(x)
-        return self._section.lifted(x, self.curve.sample(self._section.plane(x)))
+        return self._section.lift(x, self.curve.sample(self._section.plane(x)))
 
 
-class _Prism:
-    """A plane across a direction, along which nothing changes."""
+class _Extrusion:
+    """Section normal to the direction of extrusion."""
 
     def __init__(self, direction: Sequence[float]) -> None:
-        along = nonzero_vector("extruded of the RigidProfile", direction, 3)
-        # Right-handed with the direction, from the coordinate axis that is most across it.
-        first = np.eye(3)[np.argmin(np.abs(along))]
-        first = first - (first @ along) * along
+        axis = nonzero_vector("extruded of the RigidProfile", direction, 3)
+        # A right-handed basis, from the coordinate axis with the largest angle to the direction.
+        first = np.eye(3)[np.argmin(np.abs(axis))]
+        first = first - (first @ axis) * axis
         first /= np.linalg.norm(first)
-        self._axes = np.stack([first, np.cross(along, first)])
+        self._axes = np.stack([first, np.cross(axis, first)])
 
     def plane(self, x: Array) -> Array:
-        """Coordinates in the plane, (n, 2)."""
+        """Return coordinates in the section, (n, 2)."""
         return np.asarray(x @ self._axes.T)
 
-    def lifted(self, x: Array, flat: Sample) -> Sample:
-        """What is known in the plane, in space."""
+    def lift(self, x: Array, flat: Sample) -> Sample:
+        """Map a sample of the section to 3D."""
         curvature = np.einsum("ai,nab,bj->nij", self._axes, flat.curvature, self._axes)
         return Sample(flat.distance, flat.normal @ self._axes, curvature)
 
 
 class _Revolution:
-    """The half-plane of an axis: distance from it, and place along it."""
+    """Meridian half-plane of an axis of revolution."""
 
     def __init__(self, axis: tuple[Sequence[float], Sequence[float]]) -> None:
         if not isinstance(axis, Sequence) or len(axis) != 2:
@@ -144,49 +144,49 @@ class _Revolution:
                 "direction, such as ((0, 0, 0), (0, 0, 1))"
             )
         self._origin = as_vector("point in turned of the RigidProfile", axis[0], 3)
-        self._along = nonzero_vector("direction in turned of the RigidProfile", axis[1], 3)
+        self._axis = nonzero_vector("direction in turned of the RigidProfile", axis[1], 3)
 
-    def _out(self, x: Array) -> tuple[Array, Array, Array]:
-        """Place along the axis, distance from it, and unit vectors out of it."""
+    def _cylindrical_coordinates(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return cylindrical coordinates: height, radius and radial unit vectors."""
         arm = x - self._origin
-        height = arm @ self._along
-        out = arm - height[:, None] * self._along
+        height = arm @ self._axis
+        out = arm - height[:, None] * self._axis
         radius = np.linalg.norm(out, axis=1)
-        off = radius > _ON_AXIS * np.linalg.norm(arm, axis=1)
-        # On the axis any direction across it does.
-        across = np.cross(self._along, np.eye(3)[np.argmin(np.abs(self._along))])
-        out[~off] = across / np.linalg.norm(across)
-        out[off] /= radius[off, None]
-        return height, np.where(off, radius, 0.0), out
+        off_axis = radius > _AXIS_DISTANCE_RATIO * np.linalg.norm(arm, axis=1)
+        # On the axis, any normal direction is used.
+        normal = np.cross(self._axis, np.eye(3)[np.argmin(np.abs(self._axis))])
+        out[~off_axis] = normal / np.linalg.norm(normal)
+        out[off_axis] /= radius[off_axis, None]
+        return height, np.where(off_axis, radius, 0.0), out
 
     def plane(self, x: Array) -> Array:
-        """Coordinates in the half-plane, (n, 2)."""
-        height, radius, _ = self._out(x)
+        """Return coordinates in the half-plane, (n, 2)."""
+        height, radius, _ = self._cylindrical_coordinates(x)
         return np.stack([radius, height], axis=1)
 
-    def lifted(self, x: Array, flat: Sample) -> Sample:
-        """What is known in the half-plane, in space."""
-        _, radius, out = self._out(x)
-        axes = np.stack([out, np.broadcast_to(self._along, out.shape)], axis=1)
+    def lift(self, x: Array, flat: Sample) -> Sample:
+        """Map a sample of the half-plane to 3D."""
+        _, radius, out = self._cylindrical_coordinates(x)
+        axes = np.stack([out, np.broadcast_to(self._axis, out.shape)], axis=1)
         normal = np.einsum("na,nai->ni", flat.normal, axes)
         curvature = np.einsum("nai,nab,nbj->nij", axes, flat.curvature, axes)
-        # About the axis; on it that of the profile, which crosses it at a right angle.
-        far = radius > 0.0
-        slope = -flat.normal[:, 0] / np.where(far, radius, 1.0)
-        about = np.where(far, slope, flat.curvature[:, 0, 0])
-        round_ = np.cross(self._along, out)
-        curvature += about[:, None, None] * np.einsum("ni,nj->nij", round_, round_)
+        # Circumferential curvature; on the axis equal to that of the profile.
+        off_axis = radius > 0.0
+        slope = -flat.normal[:, 0] / np.where(off_axis, radius, 1.0)
+        circumferential = np.where(off_axis, slope, flat.curvature[:, 0, 0])
+        tangent = np.cross(self._axis, out)
+        curvature += circumferential[:, None, None] * np.einsum("ni,nj->nij", tangent, tangent)
         return Sample(flat.distance, normal, curvature)
 
 
-def _mirrored(points: Array) -> tuple[Array, bool]:
-    """An open profile in the half-plane, and across the axis where it ends there; if it closes."""
+def _mirror_at_axis(points: Array) -> tuple[Array, bool]:
+    """Mirror an open profile at the axis where it ends there; return whether it is closed."""
     size = np.abs(points).max()
-    begins, ends = (points[i, 0] <= _ON_AXIS * size for i in (0, -1))
+    starts, ends = (points[i, 0] <= _AXIS_DISTANCE_RATIO * size for i in (0, -1))
     mirror = points[::-1] * np.array([-1.0, 1.0])
-    if begins and ends:
+    if starts and ends:
         return np.concatenate([points, mirror[1:-1]]), True
-    if begins:
+    if starts:
         return np.concatenate([mirror[:-1], points]), False
     if ends:
         return np.concatenate([points, mirror[1:]]), False

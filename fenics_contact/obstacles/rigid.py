@@ -1,4 +1,4 @@
-"""Rigid obstacles given by UFL: half-space, ball, cylinder, cone, signed distance, given gap."""
+"""Rigid obstacles in UFL: half-space, ball, cylinder, cone, signed distance, prescribed gap."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class HalfSpace(Obstacle):
 
     @property
     def is_flat(self) -> bool:
-        """Whether the obstacle is a plane known in numbers: if point and normal are numbers."""
+        """Whether the obstacle is a plane given by numbers."""
         given = (self.point, self.normal)
         return not any(isinstance(value, ufl.core.expr.Expr) for value in given)
 
@@ -187,22 +187,22 @@ class RoundedCone(Obstacle):
         axis = axis / ufl.sqrt(ufl.dot(axis, axis))
         tip = to_ufl(as_vector("tip of the RoundedCone", self.tip, gdim))
         c, s = ufl.cos(to_ufl(angle)), ufl.sin(to_ufl(angle))
-        here = ufl.variable(x)
-        arm = here - tip - radius * axis
+        position = ufl.variable(x)
+        arm = position - tip - radius * axis
         z = ufl.dot(arm, axis)
-        across = arm - z * axis
-        # On the axis, where this root has no derivative, only the tip's distance is used.
-        rho = ufl.sqrt(ufl.dot(across, across))
+        radial = arm - z * axis
+        # The derivative of ρ does not exist on the axis, where the distance from the tip is used.
+        rho = ufl.sqrt(ufl.dot(radial, radial))
         gap = ufl.conditional(
             ufl.lt(rho * s + z * c, 0),
             ufl.sqrt(ufl.dot(arm, arm)) - radius,
             rho * c - z * s - radius,
         )
-        return Placement(gap, -ufl.diff(gap, here))
+        return Placement(gap, -ufl.diff(gap, position))
 
 
 def _convex_radius(radius: Any, inside: bool) -> float:
-    """A radius where it is a number and the surface is convex, else infinity."""
+    """Return the radius of a convex surface if it is a number, else infinity."""
     if isinstance(radius, fem.Constant) and not radius.ufl_shape:
         radius = float(radius.value)
     return float(radius) if is_number(radius) and radius > 0.0 and not inside else np.inf
@@ -253,9 +253,9 @@ class SignedDistance(Obstacle):
             ValueError: The function fails, does not return a UFL scalar, or does not depend on x.
         """
         name = "distance of the SignedDistance"
-        here = ufl.variable(x)
+        position = ufl.variable(x)
         try:
-            gap = ufl.as_ufl(self.distance(here))
+            gap = ufl.as_ufl(self.distance(position))
         except Exception as error:
             raise ValueError(
                 f"{name} fails at a position x of {x.ufl_shape[0]} components: "
@@ -263,7 +263,7 @@ class SignedDistance(Obstacle):
                 "scalar, such as lambda x: x[1]"
             ) from error
         _check_scalar(name, gap)
-        gradient = ufl.diff(gap, here)
+        gradient = ufl.diff(gap, position)
         if isinstance(gradient, ufl.constantvalue.Zero):
             raise ValueError(
                 f"{name} is {gap}, which does not depend on x, so that there is no normal; use the "

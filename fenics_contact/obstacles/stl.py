@@ -1,4 +1,4 @@
-"""Triangles out of STL files."""
+"""Reader of STL files."""
 
 from __future__ import annotations
 
@@ -12,36 +12,34 @@ from fenics_contact.types import Array
 __all__ = ["read_stl"]
 
 
-# A binary file: 80 bytes that mean nothing, the number of triangles, and these.
-_HEADER = 84
+# Binary format: 80 bytes of comment, the number of triangles, and the triangles.
+_HEADER_BYTES = 84
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
 def read_stl(path: Path) -> tuple[Array, npt.NDArray[np.intp]]:
-    """The triangles of a binary or ASCII file: every one has corners of its own.
-
-    The normals in the file are left: by the format's rule the order of the corners says the same.
+    """Read the triangles of a binary or ASCII file; normals follow from the order of corners.
 
     Returns:
-        Corners, (3 n, 3), and their numbers, (n, 3).
+        Corners, separate for every triangle, (3 n, 3), and their numbers, (n, 3).
 
     Raises:
-        ValueError: It holds no triangles.
-        OSError: It cannot be read.
+        ValueError: The file contains no triangles.
+        OSError: The file cannot be read.
     """
     corners: Array
     data = path.read_bytes()
-    n = int(np.frombuffer(data[80:_HEADER], "<u4")[0]) if len(data) >= _HEADER else 0
-    if n and len(data) == _HEADER + n * _TRIANGLE.itemsize:
-        triangles = np.frombuffer(data, _TRIANGLE, offset=_HEADER)
+    n = int(np.frombuffer(data[80:_HEADER_BYTES], "<u4")[0]) if len(data) >= _HEADER_BYTES else 0
+    if n and len(data) == _HEADER_BYTES + n * _TRIANGLE.itemsize:
+        triangles = np.frombuffer(data, _TRIANGLE, offset=_HEADER_BYTES)
         corners = triangles["corners"].astype(np.float64).reshape(-1, 3)
     else:
-        corners = _from_text(path, data)
+        corners = _parse_ascii(path, data)
     return corners, np.arange(len(corners), dtype=np.intp).reshape(-1, 3)
 
 
-def _from_text(path: Path, data: bytes) -> Array:
-    """Corners of an ASCII file, (3 n, 3): lines that begin with "vertex"."""
+def _parse_ascii(path: Path, data: bytes) -> Array:
+    """Return the corners of an ASCII file, (3 n, 3), from lines that begin with "vertex"."""
     lines = [line.split() for line in data.splitlines()]
     try:
         rows = [[float(v) for v in words[1:]] for words in lines if words[:1] == [b"vertex"]]
