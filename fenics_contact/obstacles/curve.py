@@ -25,13 +25,9 @@ _MIN_CENTRE_RATIO = 1e-6
 class Curve:
     """Cubic spline with chord-length parametrisation, with the obstacle on its left.
 
-    Points whose closest point is an end of an open curve are outside.
-
-    Args:
-        closed: Whether the last point is connected to the first.
-
-    Attributes:
-        points: At least two interpolated points, neighbours distinct, (n, 2) (length).
+    Points whose closest point is an end of an open curve are outside. ``points`` are at least two
+    interpolated points, (n, 2) (length), neighbours distinct, the last one connected to the first
+    if ``closed``.
     """
 
     def __init__(self, points: Array, *, closed: bool) -> None:
@@ -61,14 +57,12 @@ class Curve:
         curvature = curvature / np.maximum(1.0 + curvature * distance, _MIN_CENTRE_RATIO)
         if not self._closed:
             length = np.linalg.norm(arm, axis=1)
-            at_end = np.minimum(t, self._end - t) <= _SAME_PARAMETER_RATIO * self._end
-            at_end &= length > _END_DISTANCE_RATIO * self._end
-            distance = np.where(at_end, length, distance)
-            outward = np.where(
-                at_end[:, None], arm / np.where(at_end, length, 1.0)[:, None], outward
-            )
+            off = np.minimum(t, self._end - t) <= _SAME_PARAMETER_RATIO * self._end
+            off &= length > _END_DISTANCE_RATIO * self._end
+            distance = np.where(off, length, distance)
+            outward = np.where(off[:, None], arm / np.where(off, length, 1.0)[:, None], outward)
             along = np.stack([-outward[:, 1], outward[:, 0]], axis=1)
-            curvature = np.where(at_end, 1.0 / np.where(at_end, length, 1.0), curvature)
+            curvature = np.where(off, 1.0 / np.where(off, length, 1.0), curvature)
         second = curvature[:, None, None] * np.einsum("ni,nj->nij", along, along)
         return Sample(distance, -outward, second)
 

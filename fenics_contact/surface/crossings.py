@@ -104,21 +104,13 @@ def largest_depth_on_path(
 ) -> Array:
     """Return the largest penetration depth of this rank's points on their paths. Collective.
 
-    The depth is sampled at times between which no point moves by more than half a facet. It is
-    measured from the nearest facet whose lateral distance does not exceed its normal distance, so
-    that points that enter through the surface and leave where there are no facets are included.
-
-    Args:
-        comm: Communicator.
-        start: Initial points, (n, d) (length).
-        end: Final points, (n, d) (length).
-        since: Time from which on the depth counts, (n,).
-        vertices: Global vertex numbers of the cell of each point, (n, n_vertices).
-        facets: Facets of this rank.
+    The depth is sampled at times between which no point moves by more than half a facet, from
+    ``since`` on, (n,); other arguments as for `find_crossings`. It is measured from the nearest
+    facet whose lateral distance does not exceed its normal distance: points may leave the body
+    where there are no facets.
 
     Returns:
-        Depth, (n,) (length); 0 for points that are below no facet; infinite if the paths are too
-        long to be sampled.
+        Depth, (n,) (length); 0 for points below no facet, infinite if paths are too long.
     """
     first, n = comm.exscan(len(start)) or 0, len(start)
     start, end, since = (gather_rows(comm, rows) for rows in (start, end, since))
@@ -169,8 +161,7 @@ def _find_candidates(
     centre, radius = _bounding_balls(np.stack([start, end], axis=1))
     corners = np.concatenate([facets.start, facets.end], axis=1)
     middle, reach = _bounding_balls(corners)
-    # Each path searches as far as the largest ball of the other set reaches. The set of more varied
-    # sizes is the one that searches: fewer candidates are found.
+    # The set of more varied sizes searches, which yields fewer candidates.
     place: Any
     facet: Any
     finite = np.flatnonzero(np.isfinite(radius))  # an obstacle may have no normal

@@ -64,8 +64,8 @@ class FacetPlaces:
     ) -> Array:
         """Compute the positions of the nodes from those of the quadrature points.
 
-        Only the part of geometry and displacement that the points do not determine is evaluated
-        from u: round-off would move plane facets off the surfaces that they touch.
+        Only what the points do not determine is evaluated from u: round-off would move plane facets
+        off the surfaces that they touch.
 
         Args:
             points: Positions of this rank's points in a moving frame, (n_points, gdim) (length).
@@ -86,15 +86,12 @@ class FacetPlaces:
         return positions.reshape(-1, points.shape[1])
 
     def values(self, field: Array, facet: Index, reference: Array) -> Array:
-        """Interpolate a nodal field at points on facets.
+        """Interpolate a field, given at the nodes of `at_nodes`, at points on facets, (n, gdim).
 
         Args:
-            field: Values at this rank's nodes as ordered by `at_nodes`, (n_nodes, gdim).
+            field: Values at this rank's nodes, (n_nodes, gdim).
             facet: Facet of this rank of every point, (n,).
             reference: Reference coordinates on it, (n, gdim - 1).
-
-        Returns:
-            Values, (n, gdim), in the unit of the field.
         """
         table = tabulate(self._element, 0, reference)[0, :, :, 0]
         return np.asarray(np.einsum("nk,nkd->nd", table, self._by_facet(field)[facet]))
@@ -114,12 +111,7 @@ class FacetPlaces:
         return self.facets.outward_normals(facets, self.tangents(field))
 
     def moving_facets(self, start: Array, end: Array) -> MovingFacets:
-        """Return the facets of this rank, in flat pieces, moving between two configurations.
-
-        Args:
-            start: Initial positions of this rank's nodes, (n_nodes, gdim) (length).
-            end: Final positions of this rank's nodes, (n_nodes, gdim) (length).
-        """
+        """Return the flat pieces of facets whose nodes move from ``start`` to ``end``."""
         n_pieces, n_corners, _ = self._pieces.shape
         table = tabulate(self._element, 0, np.concatenate(self._pieces))[0, :, :, 0]
         first, last = (

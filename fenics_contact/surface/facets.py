@@ -119,13 +119,7 @@ class FacetSet:
     def positions(
         self, facet: Index, xi: Array, u: fem.Function | None = None
     ) -> tuple[Array, Array]:
-        """Return positions x(ξ), (n, d), and tangents ∂x/∂ξ, (n, d, d - 1).
-
-        Args:
-            facet: Facet of every point, (n,).
-            xi: Reference coordinates on it, (n, d - 1).
-            u: Displacement; None: the undeformed body.
-        """
+        """Return positions x(ξ), (n, d), and tangents ∂x/∂ξ, (n, d, d - 1), displaced by ``u``."""
         points = self._in_cell(facet, xi)
         nodes = self._x[self._nodes[facet]][:, :, : self._d]
         found = self._weights(self._geometry_basis, facet, points) @ nodes
@@ -163,11 +157,7 @@ class FacetSet:
         return self.combine(np.vstack([self._corners, self._middle]))
 
     def lattice(self, facets: Index | None = None) -> tuple[Index, Array]:
-        """Return facets, by default all, with their corners, edge midpoints and centres.
-
-        Returns:
-            Facets, (n,), and reference coordinates on them, (n, d - 1).
-        """
+        """Combine facets, by default all, with ξ of corners, edge midpoints and centres."""
         points = np.vstack([self._corners, self._middle])
         if self._d == 3:
             edges = (self._corners + np.roll(self._corners, -1, axis=0)) / 2
@@ -175,11 +165,7 @@ class FacetSet:
         return self.combine(points, facets)
 
     def flat_pieces(self, degree: int) -> Array:
-        """Return reference corners of the flat pieces of a facet, (n, n_corners, d - 1).
-
-        Args:
-            degree: Polynomial degree of the facets; those of degree 1 are one piece.
-        """
+        """Return reference corners of the flat pieces of a facet, (n, n_corners, d - 1)."""
         corner = self._corners
         if degree == 1:
             return corner[None]
@@ -233,11 +219,7 @@ class FacetSet:
     ) -> tuple[Index, Array, Array]:
         """Find the nearest facet of this rank that each ray hits and that faces its origin.
 
-        Args:
-            x: Origins, (n, d).
-            ray: Unit directions, (n, d); facets behind the origin are hit, too.
-            u: Displacement of the facets; None: undeformed.
-            accept: Rule that selects admissible hits.
+        Rays have origins ``x`` and unit directions, (n, d), and extend to both sides.
 
         Returns:
             Facet or -1, (n,); reference coordinates, (n, d - 1); signed distance, (n,).
@@ -257,8 +239,7 @@ class FacetSet:
         self._update_nearest(x, ray, (point[candidate], facet[candidate]), u, best, accept)
         if near == n_facets:
             return best
-        # The nearest centres need not belong to the facets that are hit. All facets nearer than a
-        # hit have their centres closer than its distance plus their radius.
+        # Facets nearer than a hit have centres closer than its distance plus their radius.
         no_hit = best[0] < 0
         uncertain = ~no_hit & (distances[:, -1] < np.abs(best[2]) + radius.max())
         for rows in (np.flatnonzero(no_hit), np.flatnonzero(uncertain)):
@@ -289,13 +270,7 @@ class FacetSet:
             target[point[chosen]] = values[chosen]
 
     def locate(self, facet: Index, x: Array, u: fem.Function | None = None) -> Array:
-        """Return reference coordinates of points on their facets, (n, d - 1).
-
-        Args:
-            facet: Facet of every point, (n,).
-            x: Points, (n, d), projected along the mean normal of the undeformed facet.
-            u: Displacement of the facets; None: undeformed.
-        """
+        """Project points on their facets along undeformed mean normals; return ξ, (n, d - 1)."""
         return self.intersect(facet, x, self.mean_normals()[facet], u)[0]
 
     def intersect(

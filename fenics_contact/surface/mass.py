@@ -12,12 +12,7 @@ __all__ = ["assembled", "mass_solver"]
 
 
 def assembled(form: fem.Form, vector: la.Vector | None = None) -> Array:
-    """Assemble a linear form and return its values, ghosts updated. Collective.
-
-    Args:
-        form: Compiled linear form.
-        vector: Vector that is overwritten; None: a new one.
-    """
+    """Assemble a form, in ``vector`` if given, and return its values, with ghosts. Collective."""
     with collective_errors(form.mesh.comm):
         if vector is None:
             vector = fem.assemble_vector(form)
@@ -34,11 +29,7 @@ def mass_solver(
 ) -> PETSc.KSP:
     """Create a Jacobi-preconditioned conjugate gradient solver for a mass matrix. Collective.
 
-    Args:
-        matrix: Symmetric positive definite matrix.
-        rtol: Relative tolerance of the residual.
-        atol: Absolute tolerance; None: PETSc's default.
-        max_it: Largest number of iterations; None: PETSc's default.
+    ``rtol`` and ``atol`` limit the residual; None stands for the default of PETSc.
     """
     ksp = PETSc.KSP().create(matrix.comm)
     ksp.setOperators(matrix)

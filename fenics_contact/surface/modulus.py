@@ -80,9 +80,9 @@ def modulus_over_height(
 ) -> fem.Function:
     """Compute E/h on Γc, with h the height of the cell over the facet, smoothed. Collective.
 
-    Between two bodies E is bounded by the largest modulus of the opposing one. A penalty that jumps
-    between facets causes pressure oscillations, of 10 % on an unstructured mesh of the
-    half-cylinder. Smoothing the logarithm keeps the result positive and independent of units.
+    Between two bodies E is bounded by the largest modulus of the opposing one. Jumps of the penalty
+    between facets would cause pressure oscillations (10 % on an unstructured half-cylinder).
+    Smoothing the logarithm keeps the result positive and independent of units.
 
     Args:
         surface: Γc.

@@ -139,12 +139,7 @@ class Pairing:
         return matrix, at_points, gap, hits.reason
 
     def at_rest(self, xi: Array, x: Array, normal: Array) -> tuple[Hits, Array]:
-        """Trace the normals of the undeformed bodies. Collective.
-
-        Args:
-            xi: Reference coordinates of the points, (n_points, d - 1).
-            x: Undeformed points, (n_points, d).
-            normal: Unit normals from body to obstacle, (n_points, d).
+        """Trace normals of undeformed points x with reference coordinates ξ. Collective.
 
         Returns:
             Hits, and the initial penetration at each of all facets of Γc (length).
@@ -169,15 +164,12 @@ class Pairing:
     def nearby(
         self, u: fem.Function, before: fem.Function | None, depth: float
     ) -> tuple[Index, Index]:
-        """Find the facets of this rank that may penetrate or have crossed others. Collective.
+        """Find local facets of both sides that may penetrate or have crossed others. Collective.
 
         Args:
             u: Displacement of the bodies.
             before: Displacement at the start of their straight motion; None: no motion.
             depth: Largest penetration of the points (length).
-
-        Returns:
-            Facets of Γc and of the opposing surface.
         """
         comm, sides = self._comm, self._sides
         ends = [side.facets.bounding_balls(u) for side in sides]
@@ -201,12 +193,7 @@ class Pairing:
         return found[0], found[1]
 
     def true_gap(self, x: Array, u: fem.Function, penetration: Array) -> tuple[Array, Array]:
-        """Compute the present gap along the normals of the deformed Γc. Collective.
-
-        Args:
-            x: Undeformed points, (n_points, d).
-            u: Displacement of the bodies.
-            penetration: Penetration of the points in their last pairing, ≥ 0, (n_points,) (length).
+        """Compute present gaps along the normals of the deformed Γc. Collective.
 
         Returns:
             Gaps, (n_points,) (length), NaN if unpaired; unit normals, (n_points, d).
@@ -218,15 +205,10 @@ class Pairing:
     def present_hits(
         self, x: Array, u: fem.Function, penetration: Array, facets: Index | None = None
     ) -> PresentHits:
-        """Trace the present normals of Γc at the points and on a lattice. Collective.
+        """Trace the present normals of Γc at the points and on the lattice of facets. Collective.
 
-        The result is cached until the displacement changes.
-
-        Args:
-            x: Undeformed points, (n_points, d).
-            u: Displacement of the bodies.
-            penetration: Penetration of the points in their last pairing, ≥ 0, (n_points,) (length).
-            facets: Facets of this rank whose lattice is included; None: those of the last call.
+        The result is cached until the displacement changes. ``facets`` are those of the last call
+        by default.
         """
         present = self._hits
         is_current = present is not None and np.array_equal(present.u, u.x.array)
@@ -278,14 +260,8 @@ class Pairing:
     def _drop_false_segments(self, facet: Any, other: Any, fraction: Array, hit: Any) -> Any:
         """Drop segments cut by facets that are not opposite, where the cover is ambiguous.
 
-        Args:
-            facet: Slave facet of every segment's points, (m,).
-            other: Global master facet that cuts it, (m,).
-            fraction: Fraction of the facet's area of the point, (m,).
-            hit: Global facet hit by the point's normal, or -1, (m,).
-
-        Returns:
-            ``facet`` with -1 for dropped segments and for facets that are then not covered.
+        ``other`` is the master facet that cuts a segment, ``hit`` that hit by the normal. Returns
+        ``facet`` with -1 for dropped segments and for facets that are then not covered.
         """
         slave, master = self._sides
         n = len(self._slave.cells)
@@ -360,9 +336,8 @@ class Pairing:
         return facet, other, slave.locate(facet, points, u), weights, fraction
 
     def _integration_degree(self) -> int:
-        """Return the degree of the integrands on a segment.
+        """Return the degree of products of point polynomials with displacements or themselves.
 
-        Integrands are products of the polynomials of the points with displacements or themselves.
         On triangles, functions of quadrilateral facets have twice the degree.
         """
         degree = self._master.space.ufl_element().degree

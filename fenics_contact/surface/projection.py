@@ -125,11 +125,7 @@ def _orient(polygons: Array) -> Array:
 
 
 def _clip(subject: Array, window: Array) -> tuple[Array, npt.NDArray[np.intp]]:
-    """Clip convex anticlockwise polygons by others (Sutherland–Hodgman), all at once.
-
-    Args:
-        subject: Corners, (n, k, 2).
-        window: Corners, (n, l, 2).
+    """Clip convex anticlockwise polygons (n, k, 2) by others (n, l, 2) (Sutherland–Hodgman).
 
     Returns:
         Corners, (n, m, 2), the first ``count`` of every row valid; count, (n,).

@@ -54,11 +54,11 @@ class _Facets:
     """The facets of all ranks.
 
     Attributes:
-        side: Topology and size of the facets.
-        corners: Corners in order around the facet, (n, n_corners, d).
-        normal: Outward unit normal, (n, d).
+        side: Topology and sizes.
+        corners: Corners in order, (n, n_corners, d) (length).
+        normal: Outward unit normals, (n, d).
         label: Number of the body, (n,).
-        radius: Distance from the centre to the farthest corner, (n,).
+        radius: Distance of the farthest corner from the centre, (n,) (length).
     """
 
     side: Side
