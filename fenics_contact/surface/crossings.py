@@ -117,29 +117,29 @@ def largest_depth_on_path(
     if not len(start):
         return np.zeros(0)
     vertices = np.concatenate(comm.allgather(vertices))
-    place, facet = _find_candidates(start, end, vertices, facets)
+    point, facet = _find_candidates(start, end, vertices, facets)
     corners = [facets.start[facet], facets.end[facet]]
     edges = [np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2) for x in corners]
     smallest = global_min(comm, np.stack(edges), empty=np.inf)
-    lengths = np.linalg.norm(end - start, axis=1)[place]
+    lengths = np.linalg.norm(end - start, axis=1)[point]
     lengths = lengths + np.linalg.norm(corners[1] - corners[0], axis=2).max(axis=1, initial=0.0)
     steps = 2 * global_max(comm, lengths) / smallest if smallest > 0 else np.inf
     if not steps <= _MAX_PATH_SAMPLES:
         return np.full(n, np.inf)
     times = np.linspace(0.0, 1.0, 1 + int(np.ceil(steps)))[1:]
     moving = [
-        _Pairs.from_facets(start[place], end[place], facets, facet, simplex)
+        _Pairs.from_facets(start[point], end[point], facets, facet, simplex)
         for simplex in facets.simplices()
     ]
     nearest: Array = np.full((len(times), len(start)), np.inf)
     for number, time in enumerate(map(float, times)):
-        rows = np.flatnonzero(since[place] <= time)
+        rows = np.flatnonzero(since[point] <= time)
         for pairs in moving:
             distance = pairs.distance(rows, time)
             is_near = pairs.lateral_distance(rows, np.full(len(rows), time)) <= np.abs(distance)
             order = np.argsort(-np.abs(distance[is_near]), kind="stable")
             found: Array = np.full(len(start), np.inf)
-            found[place[rows[is_near]][order]] = distance[is_near][order]
+            found[point[rows[is_near]][order]] = distance[is_near][order]
             row = nearest[number]
             nearest[number] = np.where(np.abs(found) < np.abs(row), found, row)
     gathered = np.array(comm.allgather(nearest))
@@ -153,48 +153,48 @@ def _find_candidates(
     start: Array, end: Array, vertices: Index, facets: MovingFacets
 ) -> tuple[Index, Index]:
     """Return pairs of a point and a facet of this rank whose paths come near each other."""
-    none: Index = np.zeros(0, dtype=np.int64)
+    empty: Index = np.zeros(0, dtype=np.int64)
     if not (len(start) and len(facets.start)):
-        return none, none
+        return empty, empty
     d = start.shape[1]
     # Bounding balls of the paths of points and facets.
     centre, radius = _bounding_balls(np.stack([start, end], axis=1))
     corners = np.concatenate([facets.start, facets.end], axis=1)
     middle, reach = _bounding_balls(corners)
     # The set of more varied sizes searches, which yields fewer candidates.
-    place: Any
+    point: Any
     facet: Any
     finite = np.flatnonzero(np.isfinite(radius))  # an obstacle may have no normal
     if not len(finite):
-        return none, none
+        return empty, empty
     longest, widest = radius[finite].max(), reach.max()
     if np.mean((reach + longest) ** (d - 1)) < np.mean((radius[finite] + widest) ** (d - 1)):
         tree = scipy.spatial.cKDTree(centre[finite])
-        facet, place = find_near_pairs(tree, middle, reach + longest)
+        facet, point = find_near_pairs(tree, middle, reach + longest)
     else:
         tree = scipy.spatial.cKDTree(middle)
-        place, facet = find_near_pairs(tree, centre[finite], radius[finite] + widest)
-    place = finite[place]
-    near = np.linalg.norm(centre[place] - middle[facet], axis=1) <= radius[place] + reach[facet]
-    near &= ~(vertices[place][:, :, None] == facets.vertices[facet][:, None, :]).any(axis=(1, 2))
-    return place[near], facet[near]
+        point, facet = find_near_pairs(tree, centre[finite], radius[finite] + widest)
+    point = finite[point]
+    near = np.linalg.norm(centre[point] - middle[facet], axis=1) <= radius[point] + reach[facet]
+    near &= ~(vertices[point][:, :, None] == facets.vertices[facet][:, None, :]).any(axis=(1, 2))
+    return point[near], facet[near]
 
 
 def _find_local_crossings(start: Array, end: Array, vertices: Index, facets: MovingFacets) -> Array:
     """Return rows (point, time, inward, depth, normal, facet) for facets of this rank."""
     d = start.shape[1]
     empty: Array = np.zeros((0, 5 + d))
-    place, facet = _find_candidates(start, end, vertices, facets)
-    if not len(place):
+    point, facet = _find_candidates(start, end, vertices, facets)
+    if not len(point):
         return empty
     found = [empty]
     for simplex in facets.simplices():
-        moving = _Pairs.from_facets(start[place], end[place], facets, facet, simplex)
+        moving = _Pairs.from_facets(start[point], end[point], facets, facet, simplex)
         rows, time, inward = moving.find_plane_crossings()
         on_facet = moving.is_on_facet(rows, time)
         rows, time, inward = rows[on_facet], time[on_facet], inward[on_facet]
         normal, depth = moving.normal(rows, time), -moving.distance(rows)
-        columns = place[rows], time, np.where(inward, 1.0, -1.0), depth, normal, facet[rows]
+        columns = point[rows], time, np.where(inward, 1.0, -1.0), depth, normal, facet[rows]
         found.append(np.column_stack(columns))
     return np.concatenate(found)
 
@@ -220,10 +220,10 @@ class _Pairs:
     def _relative_position(self, time: Array | float, rows: Index | slice) -> tuple[Array, Array]:
         """Return vectors from the first corner to the point and tangents, (n, d), (n, d - 1, d)."""
         t: Array = np.reshape(time, (-1, 1))
-        place = (1 - t) * self.start[rows] + t * self.end[rows]
+        point = (1 - t) * self.start[rows] + t * self.end[rows]
         t = t[:, :, None]
         corners = (1 - t) * self.corners_start[rows] + t * self.corners_end[rows]
-        return place - corners[:, 0], corners[:, 1:] - corners[:, :1]
+        return point - corners[:, 0], corners[:, 1:] - corners[:, :1]
 
     def _scaled_normal(self, tangents: Array, rows: Index | slice) -> Array:
         """Return outward normals, not normalised."""

@@ -52,11 +52,11 @@ FINEST_RULE = {2: 78, 3: 6}
 #     tetrahedra, 1: 5: 0.993 and 0.997, 6: 0.97 and 0.99, 8: 0.93;
 #     tetrahedra, 2: 2: 1.00 and 1.00, 3: 0.97 and 0.99, 4: 0.91.
 # In 2D it is at least 0.997 up to a ratio of 200; with segmentation the error is below 1e-4.
-_NODES_PER_POINT = 1.25
-# Increase of the length ratio above which the widths of anisotropic master facets decide; right
-# angles in triangles alone cause 1.7.
+_MAX_NODES_PER_POINT = 1.25
+# Factor by which the width ratio of anisotropic facets must exceed the length ratio to be used;
+# right angles in triangles alone cause 1.7.
 _ANISOTROPY_RATIO = 2.0
-# Increase of the length ratio above which the local one decides; uniform meshes have less.
+# Factor by which the local length ratio must exceed the median one to be used: graded meshes.
 _GRADING_RATIO = 1.5
 # Smallest number of points of Γc per smallest radius of a rigid obstacle, times the element degree.
 # A cylinder of radius R is pressed 0.3 R into rubber and slides. Ratio of the force to that with 8
@@ -170,7 +170,7 @@ class ContactSurface:
             wanted = ratio * (degree + 2) - 2
             degree = max(degree, min(wanted, FINEST_RULE[dim]))
             nodes_per_point = ratio * element_degree / (degree // 2 + 1)
-            is_sparse = dim == 3 and not pieces and nodes_per_point > _NODES_PER_POINT
+            is_sparse = dim == 3 and not pieces and nodes_per_point > _MAX_NODES_PER_POINT
             if is_sparse and scheme == "default":
                 sparse = Sparse(ratio, wanted)
         return SurfaceQuadrature(self, degree, scheme, sparse)
