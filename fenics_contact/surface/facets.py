@@ -59,6 +59,8 @@ def facet_nodes(space: fem.FunctionSpace, facets: Index) -> Index:
 class FacetSet:
     """Facets of this rank, parametrised by reference coordinates ξ of dimension d - 1.
 
+    Methods take the local facet of every point, (n,), with ξ, (n, d - 1), and a displacement u.
+
     Args:
         space: Displacement space.
         facets: Facets of this rank, (n_facets,).
