@@ -109,12 +109,12 @@ def test_schur_complement(cell, degree, symmetric):
         prescribed = np.where(held & ~np.isin(np.arange(n), kept), state, 0.0)
         lifted = force - K @ prescribed
         load = lifted[kept] - away @ lifted[inside]
-        assert not first or close(made.response.load, load, 1e-10)
+        assert not first or close(made.particular.load, load, 1e-10)
         field = prescribed + 0.0
         field[kept] = state[kept]
         field[inside] = inverse @ (force - K @ field)[inside]
         given = state[kept] if first else np.zeros(0)
-        found = gathered(COMM, made.response.field + made.extended(given))
+        found = gathered(COMM, made.particular.field + made.extend(given))
         assert close(found, field, 1e-10)
 
 
@@ -260,7 +260,7 @@ def test_several_contacts_and_loads():
             found.append([r.force for r in step.contacts.values()])
         # Both loads are two fields times numbers: factored once, and solved for once each.
         if condensed:
-            assert len(problem.solver.system.condensation.directions) == 2
+            assert len(problem.solver.system.condensation.load_directions) == 2
         results.append({"u": owned(scene.u).copy(), "forces": np.array(found)})
     assert_same(*results)
 

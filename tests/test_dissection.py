@@ -5,7 +5,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from fenics_contact.systems.dissection import Dissection, Eliminated
+from fenics_contact.systems.dissection import BlockFactorisation, Dissection
 from scenes.comparing import close
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="every rank does it by itself")
@@ -65,13 +65,13 @@ def test_dissection(symmetric, shift, inner):
     rng = np.random.default_rng(6)
     force, boundary = np.zeros(n), rng.normal(size=stays.size)
     force[inside] = rng.normal(size=inside.size)
-    partial = made.push(force)
-    assert close(partial.pushed[stays], -away @ force[inside], 1e-10)
+    partial = made.eliminate(force)
+    assert close(partial.reduced_rhs[stays], -away @ force[inside], 1e-10)
     for given, load in ((boundary, 0 * force), (0 * boundary, force), (boundary, force)):
         expected = np.zeros(n)
         expected[stays] = given
         expected[inside] = inverse @ (load[inside] - K[np.ix_(inside, stays)] @ given)
-        assert close(made.complete(given, made.push(load)), expected, 1e-10)
+        assert close(made.back_substitute(given, made.eliminate(load)), expected, 1e-10)
 
 
 def test_a_part_that_nothing_holds_is_refused():
@@ -79,4 +79,4 @@ def test_a_part_that_nothing_holds_is_refused():
     matrix = np.zeros((3, 3), order="F")
     matrix[2, 2] = 1.0
     with pytest.raises(RuntimeError, match="singular"):
-        Eliminated(matrix, 2, symmetric=True)
+        BlockFactorisation(matrix, 2, symmetric=True)

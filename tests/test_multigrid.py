@@ -211,7 +211,7 @@ def test_chosen_where_factors_do_not_fit(caplog, monkeypatch):
     with caplog.at_level(logging.INFO, logger="fenics_contact"):
         problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
         assert problem.full.linear_kind == "direct"
-        monkeypatch.setattr(linear, "memory", lambda comm: 1e4)
+        monkeypatch.setattr(linear, "find_available_memory", lambda comm: 1e4)
         problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
     assert not problem.solver.condensed
     assert problem.full.linear_kind == "multigrid"
@@ -223,12 +223,12 @@ def test_chosen_where_factors_do_not_fit(caplog, monkeypatch):
 
 def test_chosen_where_it_is_quicker():
     """In three dimensions, for many unknowns; for more if one factorisation serves a history."""
-    assert not linear.quicker(10_000, 3)
-    assert linear.quicker(100_000, 3)
-    assert linear.quicker(100_000, 3, condensed_for=1)
-    assert not linear.quicker(100_000, 3, condensed_for=4)
-    assert linear.quicker(1_000_000, 3, condensed_for=4)
-    assert not linear.quicker(1_000_000, 2)
+    assert not linear.is_multigrid_faster(10_000, 3)
+    assert linear.is_multigrid_faster(100_000, 3)
+    assert linear.is_multigrid_faster(100_000, 3, condensed_for=1)
+    assert not linear.is_multigrid_faster(100_000, 3, condensed_for=4)
+    assert linear.is_multigrid_faster(1_000_000, 3, condensed_for=4)
+    assert not linear.is_multigrid_faster(1_000_000, 2)
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -259,8 +259,8 @@ def test_chosen_by_the_number_of_increments(monkeypatch):
     """Multigrid for few increments, condensed for many; settled with the first solution."""
     scene = block("hexahedron", n=2)
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
-    monkeypatch.setattr(linear, "_MANY", 0)
-    monkeypatch.setattr(linear, "_MANY_PER_INCREMENT", problem.full.unknowns.n_global / 2.5)
+    monkeypatch.setattr(linear, "_MULTIGRID_SIZE", 0)
+    monkeypatch.setattr(linear, "_SIZE_PER_INCREMENT", problem.full.unknowns.n_global / 2.5)
     assert problem.solver.condensed
     problem.expected_increments = 2
     assert not problem.solver.condensed and problem.full.linear_kind == "multigrid"
@@ -342,8 +342,8 @@ def test_monitors_outlive_the_choice_of_the_solver(monkeypatch):
     """`increments` may make SNES anew: what watches it is called all the same, as it was set."""
     scene = block("hexahedron", n=2, up=-1.0)
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
-    monkeypatch.setattr(linear, "_MANY", 0)
-    monkeypatch.setattr(linear, "_MANY_PER_INCREMENT", problem.full.unknowns.n_global / 2.5)
+    monkeypatch.setattr(linear, "_MULTIGRID_SIZE", 0)
+    monkeypatch.setattr(linear, "_SIZE_PER_INCREMENT", problem.full.unknowns.n_global / 2.5)
     before, seen = problem.snes, []
 
     def watch(snes, iteration, norm, name, *, unit):

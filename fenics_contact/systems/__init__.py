@@ -1,1 +1,1 @@
-"""The equations on all unknowns, or condensed onto those that contact touches."""
+"""The discrete equations on all unknowns, or on those retained by static condensation."""

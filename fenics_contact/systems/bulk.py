@@ -1,8 +1,7 @@
-"""The user's bulk form as a map u -> F(u) with a tangent, treated once where it is linear.
+"""The residual form of the bulk as a map u → F(u) with its tangent, assembled once if linear.
 
-Of a mixed function the parts beside the displacement, such as pressures, are counted in units of
-their own: with them they are lengths, and their equations forces, as large as those of
-displacements. So all that is judged by forces, or scaled by stiffness, can be.
+The additional fields of a mixed function, such as pressures, are scaled so that they are lengths
+and their equations forces, of the magnitude of displacements and of forces on them.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from fenics_contact.types import Array, Indices
 
 __all__ = ["Bulk"]
 
-_OF_ONE = (
+_MIXED_HINT = (
     "; several fields must be one function w of a mixed element, whose residual has the "
     "test functions v, q = ufl.TestFunctions(W)"
 )
@@ -39,21 +38,21 @@ class Bulk:
     """The bulk residual F(u; v), without contact. The constructor is collective.
 
     Attributes:
-        form: The residual, UFL, with one object of tags for each kind of measure.
-        space: Of ``u``.
-        displacement: What of ``u`` is one.
-        units: Of every dof of this rank, ghosts too: values over units are what all others see, and
-            residuals times units; None: all are 1. They stay as they are from the first `update`.
-        tangent_form: Its derivative by ``u``, UFL.
-        linear: Whether F is affine in ``u``: then its tangent is assembled once, a residual is a
-            product with it, and loads are assembled once an increment.
+        form: The residual (UFL), with one `subdomain_data` for each kind of measure.
+        space: Function space of ``u``.
+        displacement: The displacement within ``u``.
+        units: Scale of every dof of this rank, ghosts included, fixed at the first `update`; None:
+            all are 1. All other classes use values over units, and residuals times units.
+        tangent_form: The derivative of the residual with respect to ``u`` (UFL).
+        linear: Whether F is affine in ``u``: its tangent is then assembled once, and its loads once
+            per increment.
         symmetric: Whether the assembled tangent is symmetric.
         stiffness: The tangent without Dirichlet conditions, valid after `update`.
-        scale: Largest entry on the tangent's diagonal, the unit of stiffness (force/length); of a
-            nonlinear bulk on that of the first tangent, so that it is one unit all the way.
+        scale: Largest diagonal entry of the tangent, of the first one if F is not linear: the unit
+            of stiffness (force/length).
 
     Raises:
-        ValueError: ``form`` is no residual in the space of ``u``.
+        ValueError: ``form`` is not a residual in the space of ``u``.
     """
 
     def __init__(self, form: ufl.Form, displacement: Displacement) -> None:
@@ -62,11 +61,11 @@ class Bulk:
             raise ValueError(
                 f"F is a {type(form).__name__}; it must be the UFL residual of the bulk, such as "
                 "inner(sigma(u), epsilon(v))*dx - inner(load, v)*ds"
-                + (_OF_ONE if isinstance(form, list | tuple) else "")
+                + (_MIXED_HINT if isinstance(form, list | tuple) else "")
             )
         arguments = form.arguments()
         if any(argument.part() is not None for argument in arguments):
-            raise ValueError(f"F has test functions of several spaces{_OF_ONE}")
+            raise ValueError(f"F has test functions of several spaces{_MIXED_HINT}")
         if not arguments:
             raise ValueError(
                 "F has no TestFunction; it must be a residual: for an energy use "
@@ -101,7 +100,7 @@ class Bulk:
         self.form, self.space = form, u.function_space
         derivative = ufl.derivative(form, u, ufl.TrialFunction(u.function_space))
         self.tangent_form = ufl.algorithms.expand_derivatives(derivative)
-        self.linear = not (u in self.tangent_form.coefficients() or _branches_by(form, u))
+        self.linear = not (u in self.tangent_form.coefficients() or _has_condition_on(form, u))
         self._volumes = None if self.linear else _Volumes(displacement)
         kinds = dict.fromkeys(integral.integral_type() for integral in form.integrals())
         parts = (_Part(form, kind, u) for kind in kinds)
@@ -122,15 +121,14 @@ class Bulk:
         self._n_owned: int = dofmap.index_map.size_local * dofmap.index_map_bs
         tangent = self.tangent_form
         self._dependence = Dependence(tangent.constants(), tangent.coefficients())
-        # What the tangent at rest depends on.
         data = [c for c in tangent.coefficients() if c is not u]
         self._data = Dependence(tangent.constants(), data)
 
     def check_finite(self) -> None:
-        """Refuse values that are not finite in any coefficient or constant. Collective.
+        """Check that all coefficients and constants are finite. Collective.
 
         Raises:
-            ValueError: It names the coefficient.
+            ValueError: One is not; the message names it.
         """
         comm = self._u.function_space.mesh.comm
         for kind, items in (
@@ -147,14 +145,14 @@ class Bulk:
                     )
 
     def is_current(self) -> bool:
-        """Whether the tangent is that of the present data: False if it may differ. Collective."""
+        """Return whether the tangent is that of the present data. Collective."""
         if not self.linear:
             return False
         changed = self._dependence.changed
         return self._u.function_space.mesh.comm.allreduce(int(changed)) == 0
 
     def update(self) -> bool:
-        """Assemble the tangent at ``u`` if it may have changed; True if it did. Collective."""
+        """Assemble the tangent if it may have changed; return whether it was. Collective."""
         if self.is_current():
             return False
         self._dependence.forget()  # until the matrix is complete
@@ -166,7 +164,7 @@ class Bulk:
             sizes = np.abs(diagonal.array_r * of_displacement)
             self.scale = global_max(self._u.function_space.mesh.comm, sizes)
         if self.displacement.mixed:
-            self._take_units()
+            self._apply_units()
             diagonal.destroy()
             diagonal = self.stiffness.getDiagonal()
         self.symmetric = self._is_symmetric(diagonal)
@@ -177,27 +175,27 @@ class Bulk:
 
     @contextmanager
     def present_stiffness(self) -> Iterator[PETSc.Mat]:
-        """The tangent at the present ``u`` and data; `stiffness` stays as it is. Collective."""
+        """Yield the tangent at the present ``u`` without changing `stiffness`. Collective."""
         if self.is_current():
             yield self.stiffness
             return
         matrix = fem.petsc.create_matrix(self._pattern)
         self._assemble_tangent(matrix)
-        self._in_units(matrix)
+        self._scale_by_units(matrix)
         try:
             yield matrix
         finally:
             matrix.destroy()
 
     def _assemble_tangent(self, matrix: PETSc.Mat) -> None:
-        """Add the tangent at the present ``u`` to a matrix of its pattern. Collective."""
+        """Add the tangent at the present ``u`` to a matrix. Collective."""
         for part in self._compiled_tangent:
             fem.petsc.assemble_matrix(matrix, part)
         matrix.assemble()
 
     @contextmanager
     def stiffness_at_rest(self) -> Iterator[PETSc.Mat]:
-        """The tangent at u = 0 with the present data; `stiffness` stays as it is. Collective."""
+        """Yield the tangent at u = 0 without changing `stiffness`. Collective."""
         values = self._u.x.array
         saved = values.copy()
         values[:] = 0.0
@@ -209,21 +207,22 @@ class Bulk:
             values[:] = saved
 
     def has_new_data(self) -> bool:
-        """Whether data of the tangent have changed since `note_data` was called. Collective."""
+        """Return whether tangent data have changed since `note_data`. Collective."""
         return self.space.mesh.comm.allreduce(int(self._data.changed)) > 0
 
     def note_data(self) -> None:
-        """Take the data of the tangent as they are now for known."""
+        """Record the present data of the tangent."""
         self._data.note()
 
     def own_stiffness(self) -> PETSc.Mat:
-        """The tangent of this rank's cells alone, ghosts behind its own dofs. Collective.
+        """Return the tangent of this rank's cells, with rows of ghosts last. Collective.
 
-        On one rank that is `stiffness`, and otherwise a new matrix: the ranks' add up to it.
+        On one rank it is `stiffness`; on several it is a new matrix, and the sum over the ranks is
+        `stiffness`.
         """
         if self.space.mesh.comm.size == 1:
             return self.stiffness
-        # Entries of rows of ghosts are still here, not where their owners would add them up.
+        # Unlike that of `fem.petsc`, this matrix keeps the rows of ghosts on this rank.
         matrix = fem.create_matrix(self._pattern)
         for part in self._compiled_tangent:
             fem.assemble_matrix(matrix, part)
@@ -233,10 +232,10 @@ class Bulk:
         return PETSc.Mat().createAIJ(rows.shape, csr=csr, comm=PETSc.COMM_SELF)
 
     def check_elastic(self) -> None:
-        """Refuse a tangent without stiffness, after `update`.
+        """Check that the assembled tangent has a positive, finite diagonal entry.
 
         Raises:
-            ValueError: It says what was found.
+            ValueError: It has none.
         """
         if not (np.isfinite(self.scale) and self.scale > 0):
             raise ValueError(
@@ -245,14 +244,14 @@ class Bulk:
             )
 
     def update_load(self) -> Array:
-        """F(0), minus the external forces, at this rank's owned dofs. Collective."""
+        """Assemble F(0), minus the external forces, at this rank's owned dofs. Collective."""
         with collective_errors(self._u.function_space.mesh.comm):
-            self._load.x.array[:] = sum(part.at_rest() for part in self._parts)
+            self._load.x.array[:] = sum(part.assemble_at_zero() for part in self._parts)
         self._load.x.scatter_reverse(dolfinx.la.InsertMode.add)
-        return self._owned(self._load)
+        return self._owned_residual(self._load)
 
     def residual(self) -> Array:
-        """F(u) at this rank's owned dofs; a linear bulk needs `update_load` before. Collective."""
+        """Evaluate F(u) at this rank's owned dofs, if linear after `update_load`. Collective."""
         if not self.linear:
             return self.assemble_residual()
         state = self._u
@@ -261,71 +260,67 @@ class Bulk:
             state.x.array[:] = self._u.x.array / self.units
         self.stiffness.mult(state.x.petsc_vec, self._image.x.petsc_vec)
         n = self._n_owned
-        return self._image.x.array[:n] + self._owned(self._load)
+        return self._image.x.array[:n] + self._owned_residual(self._load)
 
     def assemble_residual(self) -> Array:
-        """F(u) by assembly, whatever the bulk. Collective."""
+        """Assemble F(u) at this rank's owned dofs, also if it is linear. Collective."""
         self._image.x.array[:] = 0.0
         with collective_errors(self._u.function_space.mesh.comm):
             for part in self._parts:
                 part.assemble(self._image.x.array)
         self._image.x.scatter_reverse(dolfinx.la.InsertMode.add)
-        return self._owned(self._image)
+        return self._owned_residual(self._image)
 
     def is_inverted(self) -> bool:
-        """Whether cells are turned inside out by ``u``. Collective.
+        """Return whether det(I + grad u) ≤ 0 at a point of a nonlinear bulk. Collective.
 
-        That is det(I + grad u) ≤ 0 at a point of the bulk: many forms of hyperelastic bodies have
-        solutions there. With a linear bulk displacements are small, and nothing is looked at.
+        Many hyperelastic forms have spurious solutions there.
         """
-        return self._volumes is not None and not self._volumes.least() > 0
+        return self._volumes is not None and not self._volumes.find_minimum() > 0
 
-    def _owned(self, function: fem.Function) -> Array:
-        """A residual at this rank's owned dofs, by its unit; a copy."""
+    def _owned_residual(self, function: fem.Function) -> Array:
+        """Return a residual at this rank's owned dofs in force units, a copy."""
         values = function.x.array[: self._n_owned]
         return values.copy() if self.units is None else values * self.units[: self._n_owned]
 
     def in_units(self, values: Array) -> Array:
-        """Values of ``u`` at dofs of this rank, from the first on, as all others see them; a copy.
-
-        The other way round: `from_units`.
-        """
+        """Return values of the first dofs of this rank divided by their units, a copy."""
         return values.copy() if self.units is None else values / self.units[: values.size]
 
     def from_units(self, values: Array) -> Array:
-        """The inverse of `in_units`."""
+        """Return values multiplied by the units of their dofs, a copy."""
         return values.copy() if self.units is None else values * self.units[: values.size]
 
-    def _take_units(self) -> None:
-        """Measure the units, the first time, and put `stiffness` in them. Collective."""
+    def _apply_units(self) -> None:
+        """Scale `stiffness` by the units, which are measured the first time. Collective."""
         if self.units is None:
             units = fem.Function(self.space)
             units.x.array[:] = 1.0
             for _, dofs in self.displacement.others:
-                units.x.array[dofs] = self._unit(dofs)
+                units.x.array[dofs] = self._measure_unit(dofs)
             self.units = units.x.array
-        self._in_units(self.stiffness)
+        self._scale_by_units(self.stiffness)
 
-    def _unit(self, dofs: Indices) -> float:
-        """Of a part: with it what couples it to displacements is as stiff as these. Collective.
+    def _measure_unit(self, dofs: Indices) -> float:
+        """Return the unit of a field that makes its coupling to displacements `scale`. Collective.
 
-        A part that is coupled to others alone, or by round-off as bubbles are, is as stiff in
-        itself.
+        A field that is coupled to others only, or by round-off, has its own diagonal block for
+        that.
         """
         mask = np.zeros(self._n_owned)
         mask[dofs[dofs < self._n_owned]] = 1.0
         displacements = self.displacement.within(np.ones(self.displacement.n_owned))
-        coupling = self._block_size(mask, displacements)
-        own = self._block_size(mask, mask)
-        if coupling > NEGLIGIBLE * np.sqrt(self.scale * own):
+        coupling = self._block_norm(mask, displacements)
+        diagonal = self._block_norm(mask, mask)
+        if coupling > NEGLIGIBLE * np.sqrt(self.scale * diagonal):
             unit = self.scale / coupling
         else:
-            unit = np.sqrt(self.scale / own) if own > 0 else 1.0
-        # A power of two, by which no digit is lost: a file has values, and a state is by units.
+            unit = np.sqrt(self.scale / diagonal) if diagonal > 0 else 1.0
+        # A power of two scales without round-off.
         return float(2.0 ** np.round(np.log2(unit)))
 
-    def _block_size(self, rows: Array, columns: Array) -> float:
-        """Largest sum of absolute values in a row of a block of `stiffness`. Collective."""
+    def _block_norm(self, rows: Array, columns: Array) -> float:
+        """Return the infinity norm of a block of `stiffness`. Collective."""
         block = self.stiffness.copy()
         left, right = block.createVecLeft(), block.createVecRight()
         left.array[:], right.array[:] = rows, columns
@@ -335,8 +330,8 @@ class Bulk:
             item.destroy()
         return size
 
-    def _in_units(self, matrix: PETSc.Mat) -> None:
-        """Put a tangent in the units. Collective."""
+    def _scale_by_units(self, matrix: PETSc.Mat) -> None:
+        """Scale rows and columns of a tangent by the units. Collective."""
         if self.units is not None:
             scaling = matrix.createVecLeft()
             scaling.array[:] = self.units[: self._n_owned]
@@ -359,11 +354,10 @@ class Bulk:
 
 
 class _Volumes:
-    """Change of volume det(I + grad u) at the points of a lattice of degree 2p in every cell.
+    """det(I + grad u) at the points of a lattice of degree 2p in every cell, vertices included.
 
-    The vertices of the cell are among them. There det(I + grad u) of bilinear displacements, which
-    varies linearly over a straight quadrilateral, is extreme; points inside alone, as those of a
-    Gauss rule, do not show a corner that is turned inside out. The constructor is collective.
+    For bilinear displacements it is extreme at the vertices of a straight quadrilateral, which
+    Gauss points miss. The constructor is collective.
     """
 
     def __init__(self, displacement: Displacement) -> None:
@@ -378,16 +372,16 @@ class _Volumes:
         )
         self._change = compile_expression(ufl.det(ufl.Identity(len(u)) + ufl.grad(u)), points)
 
-    def least(self) -> float:
-        """At the present u, over all ranks; NaN where it is none. Collective."""
+    def find_minimum(self) -> float:
+        """Return the minimum at the present u over all ranks, NaN included. Collective."""
         values = self._change.eval(self._mesh, self._cells)
         return global_min(self._mesh.comm, values, empty=np.inf)
 
 
-def _branches_by(form: ufl.Form, u: fem.Function) -> bool:
-    """Whether there is a condition on ``u`` in a form, which its derivative need not show.
+def _has_condition_on(form: ufl.Form, u: fem.Function) -> bool:
+    """Return whether a form has a condition on ``u``.
 
-    A load that steps from one constant to another has none.
+    The derivative need not show it, as for a load that jumps from one constant to another.
     """
     expanded = ufl.algorithms.expand_derivatives(form)
     return any(
@@ -398,41 +392,40 @@ def _branches_by(form: ufl.Form, u: fem.Function) -> bool:
 
 
 class _Part:
-    """The integrals of F of one kind: over cells, over exterior facets ...
+    """The integrals of F of one type, such as cells, compiled by quadrature rule.
 
-    Taken apart no further but by rules, so that every integral keeps the one that it has in F. The
-    constructor is collective.
+    The constructor is collective.
     """
 
     def __init__(self, form: ufl.Form, kind: str, u: fem.Function) -> None:
-        mine = ufl.Form([i for i in form.integrals() if i.integral_type() == kind])
-        self.empty = ufl.algorithms.expand_derivatives(mine).empty()  # a load that is 0 in UFL
-        still = ufl.replace(mine, {u: ufl.zero(u.ufl_shape)})
-        self._vanishes = ufl.algorithms.expand_derivatives(still).empty()
-        self._compiled = compile_by_rule(mine)
+        integrals = ufl.Form([i for i in form.integrals() if i.integral_type() == kind])
+        self.empty = ufl.algorithms.expand_derivatives(integrals).empty()  # a load that is 0 in UFL
+        at_zero = ufl.replace(integrals, {u: ufl.zero(u.ufl_shape)})
+        self._vanishes = ufl.algorithms.expand_derivatives(at_zero).empty()
+        self._compiled = compile_by_rule(integrals)
         self._u = u
-        others = [c for c in mine.coefficients() if c is not u]
-        self._dependence = Dependence(mine.constants(), others)
-        self._at_rest: Array = np.zeros(u.x.array.size)
+        others = [c for c in integrals.coefficients() if c is not u]
+        self._dependence = Dependence(integrals.constants(), others)
+        self._at_zero: Array = np.zeros(u.x.array.size)
 
     def assemble(self, target: Array) -> None:
-        """Add to ``target``, ghosts not collected."""
+        """Add the integrals to ``target``, without summing up ghosts."""
         for part in self._compiled:
             fem.assemble_vector(target, part)
 
-    def at_rest(self) -> Array:
-        """Values at u = 0, ghosts not collected; assembled if they may have changed."""
+    def assemble_at_zero(self) -> Array:
+        """Return the values at u = 0, without summing up ghosts, cached."""
         if self._vanishes:
-            return self._at_rest
+            return self._at_zero
         if self._dependence.changed:
             self._dependence.forget()  # until the assembly is complete
             u = self._u.x.array
             saved = u.copy()
             u[:] = 0.0
-            self._at_rest[:] = 0.0
+            self._at_zero[:] = 0.0
             try:
-                self.assemble(self._at_rest)
+                self.assemble(self._at_zero)
             finally:
                 u[:] = saved
             self._dependence.note()
-        return self._at_rest
+        return self._at_zero

@@ -1,10 +1,8 @@
-"""Where bodies can touch in this increment: the candidates among the points of Γc.
+"""Selection of the dofs to retain: those of the points of Γc that may come into contact.
 
-Users tag generously. Points that stay open take no part in the equations, and the unknowns that
-they alone feel need not be kept. Which will close is not known before, and no bound on the motion
-of an elastic body is both safe and of use. So the candidates are the points that bear now and those
-nearest to bearing, as many as cost next to nothing. With what they lead to all of Γc is evaluated:
-if the law acts elsewhere there have to be more of them.
+Dofs of points that stay open need not be retained. No bound on the displacement of an elastic body
+is both safe and useful, so the candidates are the active points and the nearest others, as many as
+are inexpensive. All of Γc is evaluated afterwards, and the selection enlarged if necessary.
 """
 
 from __future__ import annotations
@@ -24,21 +22,21 @@ __all__ = ["active_points", "distances", "nearest", "touched"]
 
 
 def active_points(contact: Contact) -> Mask:
-    """At which of this rank's points the law acts, as evaluated, or would act on any slip.
+    """Return the mask of this rank's active points, (n_points,), as evaluated.
 
-    Friction of a given limit does so where the gap is open, too.
+    A point with a given friction bound is active even if its gap is open.
     """
     values = contact.values
-    # What is not a number tells nothing.
+    # Comparisons with NaN are false.
     acts = np.any(np.abs(values.total_traction) > 0.0, axis=1) | (values.friction_bound > 0.0)
     return np.asarray((contact.status != Status.OPEN) | (acts & contact.paired))
 
 
 def distances(contact: Contact) -> Array:
-    """How far this rank's points are from bearing, as evaluated, (n_points,) (length).
+    """Return the distance of this rank's points from contact, (n_points,) (length).
 
-    Minus infinity where the law acts, and at all points if the gap is prescribed: what closes it
-    then is no motion. Infinity at points without an opposite.
+    It is -∞ at active points, and at all points if the gap is prescribed, since the gap is then not
+    closed by displacements. It is ∞ at points without an opposite point.
     """
     gap = np.where(contact.paired, contact.values.gap, np.inf)
     return np.where(active_points(contact) | contact.gap_prescribed, -np.inf, gap)
@@ -49,19 +47,16 @@ def touched(
     unknowns: Unknowns,
     points: Sequence[Mask] | None = None,
 ) -> Indices:
-    """This rank's unknowns that contact feels or acts on, ascending. Collective.
+    """Return this rank's unknowns that the contacts couple, ascending. Collective.
 
-    Args:
-        operators: Over all unknowns.
-        unknowns: These.
-        points: For every operator the points at which there may be contact; None: all of Γc.
+    The points may be restricted by a mask for every operator.
     """
-    found = np.zeros(unknowns.n_local, dtype=np.bool_)
-    found[unknowns.n_dofs :] = True
+    coupled = np.zeros(unknowns.n_local, dtype=np.bool_)
+    coupled[unknowns.n_dofs :] = True
     for number, operator in enumerate(operators):
-        mine = operator.reachable if points is None else operator.touched_by(points[number])
-        found[mine] = True
-    return np.flatnonzero(found).astype(np.int32)
+        dofs = operator.possible_dofs if points is None else operator.find_dofs(points[number])
+        coupled[dofs] = True
+    return np.flatnonzero(coupled).astype(np.int32)
 
 
 def nearest(
@@ -71,28 +66,27 @@ def nearest(
     wanted: int,
     round_off: float,
 ) -> Indices:
-    """This rank's unknowns that the nearest points touch, ascending. Collective.
+    """Return this rank's unknowns that the points nearest to contact couple. Collective.
 
     Args:
-        operators: Over all unknowns.
-        unknowns: These.
+        operators: Contact operators over all unknowns.
+        unknowns: All unknowns.
         away: `distances` of every contact.
-        wanted: The most unknowns, on all ranks; more only where the law acts at more points.
-        round_off: Of the distances: points as far away as the last that is taken are taken too
+        wanted: Largest number of unknowns on all ranks, exceeded only by those of active points.
+        round_off: Round-off of the distances: points that tie with the last one are included
             (length).
     """
     comm = unknowns.comm
-    everything = touched(operators, unknowns)
-    n_touched = int(comm.allreduce(everything.size))
+    all_dofs = touched(operators, unknowns)
+    n_coupled = int(comm.allreduce(all_dofs.size))
     order = np.sort(gather_rows(comm, np.concatenate(away)))
-    n_acting = int(np.count_nonzero(order == -np.inf))
+    n_active = int(np.count_nonzero(order == -np.inf))
     n_paired = int(np.count_nonzero(order < np.inf))
-    found, n_found = everything, n_touched
+    dofs, n_dofs = all_dofs, n_coupled
     n_points = n_paired
-    while n_found > wanted and n_points > n_acting:
-        # Points and unknowns are in proportion, but for those at the edge.
-        n_points = max(n_acting, min(n_points * wanted // n_found, n_points - 1))
-        farthest = order[n_points - 1] + round_off if n_points else -np.inf
-        found = touched(operators, unknowns, [a <= farthest for a in away])
-        n_found = int(comm.allreduce(found.size))
-    return found
+    while n_dofs > wanted and n_points > n_active:
+        n_points = max(n_active, min(n_points * wanted // n_dofs, n_points - 1))
+        cutoff = order[n_points - 1] + round_off if n_points else -np.inf
+        dofs = touched(operators, unknowns, [a <= cutoff for a in away])
+        n_dofs = int(comm.allreduce(dofs.size))
+    return dofs

@@ -1,9 +1,8 @@
-"""The system on the unknowns that contact touches, where the bulk is linear.
+"""The system after static condensation of a linear bulk onto the retained unknowns.
 
-Contact acts on few unknowns, Γc's and those opposite, or those that candidates touch. With the
-others eliminated, which takes one factorisation, the bulk is a dense matrix S on these (its Schur
-complement), whatever the loads and conditions of the increments to come: S x = g + contact forces.
-An iteration costs milliseconds, and one back-substitution at its end gives the field.
+Contact couples few unknowns: those of Γc and of opposite points. Eliminating all others once gives
+the dense Schur complement S for all increments, and S x = g + contact forces. One back-substitution
+per increment recovers the interior.
 """
 
 from __future__ import annotations
@@ -24,69 +23,67 @@ from fenics_contact.types import Array, Indices
 
 __all__ = ["CondensedSystem", "all_retained", "inexpensive", "worthwhile"]
 
-# Dense matrices of this many unknowns take 200 MB each, and there are five or so.
-_LARGEST = 5000
-# A dense factorisation of fewer is a matter of milliseconds: always worth it.
-_SMALL = 500
-# A dense factorisation, n_c³ flops, is made every few iterations, and the Schur complement costs
-# more the larger it is; a sparse factorisation takes about 60 n^(3/2) flops in two dimensions and
-# 4 n² in three. Up to this share of n^((d-1)/d), the size of a surface of all of the mesh, the
-# dense one costs a quarter of the sparse one.
-_SURFACE_SHARE = {2: 3.0, 3: 1.2}
-# In the plane, up to this many and this share, it costs more than that, and less than the dozens of
-# iterations that all unknowns take. Two cylinders of `demos/fretting.py`, by cells in the contact's
-# half-width: all and retained unknowns, seconds condensed and not, pressed by one increment without
-# friction, then sheared to and fro by 20 (25 at first):
-#     16: 9,724, 596: 0.7 and 1.4, 2.2 and 8.6;  20: 12,604, 736: 1.2 and 1.9, 2.4 and 7.9;
-#     40: 32,256, 1004, the pressing all but on all unknowns: 4.1 and 24.
-_QUICK, _QUICK_SHARE = 1200, 8.0
-# Share of these up to which what is retained is hardly felt in the cost.
-_CHEAP = 0.25
-# Share of these up to which all that contact touches is retained. Where some is left out every
-# increment takes a back-substitution, which in the plane costs more than fewer unknowns save.
-_ALL = {2: 1.0, 3: 0.5}
+# Five dense matrices are stored, of 200 MB each at this number of unknowns.
+_MAX_DENSE_DOFS = 5000
+# A dense factorisation of fewer unknowns takes milliseconds.
+_CHEAP_DOFS = 500
+# Largest number of retained unknowns relative to n^((d-1)/d), the unknowns on a surface, up to
+# which a dense factorisation of n_c³ flops costs a quarter of a sparse one (60 n^(3/2) flops in two
+# dimensions, 4 n² in three).
+_MAX_SURFACE_RATIO = {2: 3.0, 3: 1.2}
+# In the plane up to this number and ratio it costs more than that, but less than iterating on all
+# unknowns. Two cylinders of `demos/fretting.py` by cells per contact half-width: all and retained
+# unknowns, seconds with and without condensation for pressing without friction in one increment,
+# then for shearing in 20 (25 at 16): 16: 9,724, 596: 0.7 and 1.4, 2.2 and 8.6; 20: 12,604, 736: 1.2
+# and 1.9, 2.4 and 7.9; 40: 32,256, 1004, pressed mostly on all unknowns: 4.1 and 24.
+_MAX_PLANE_DOFS, _MAX_PLANE_RATIO = 1200, 8.0
+# Ratio to the largest number up to which retained unknowns cost little.
+_INEXPENSIVE_RATIO = 0.25
+# Ratio to the largest number up to which all coupled unknowns are retained: recovering the others
+# takes a back-substitution per increment, which in the plane costs more than it saves.
+_RETAIN_ALL_RATIO = {2: 1.0, 3: 0.5}
 
 
 def worthwhile(n: int, n_retained: int, dimension: int) -> bool:
-    """Whether to condense ``n`` unknowns onto ``n_retained`` by memory and cost.
+    """Return whether memory and cost favour condensing ``n`` unknowns onto ``n_retained``.
 
-    The Schur complement comes with the factorisation: in two dimensions at no more than the cost
-    of a plain one (0.45 s against 0.55 s at 104,000 unknowns, 670 retained), in three at 2.3 times
-    (106,000 unknowns, 768 retained). With contact the iteration on all unknowns nearly always takes
-    more factorisations, or back-substitutions for the price of as many.
+    In two dimensions the Schur complement costs no more than a plain factorisation (0.45 s against
+    0.55 s at 104,000 unknowns, 670 retained), in three 2.3 times as much (106,000 unknowns, 768
+    retained). Iterating on all unknowns mostly takes more factorisations, or as much time in
+    back-substitutions.
     """
-    return 0 < n_retained <= _most(n, dimension)
+    return 0 < n_retained <= _max_dofs(n, dimension)
 
 
-def _most(n: int, dimension: int) -> float:
-    """How many of ``n`` unknowns are worth to be retained."""
+def _max_dofs(n: int, dimension: int) -> float:
+    """Return the largest number of unknowns worth retaining."""
     surface = n ** ((dimension - 1) / dimension)
-    quick = min(_QUICK, _QUICK_SHARE * surface) if dimension == 2 else 0.0
-    return min(_LARGEST, max(_SMALL, quick, _SURFACE_SHARE[dimension] * surface))
+    plane = min(_MAX_PLANE_DOFS, _MAX_PLANE_RATIO * surface) if dimension == 2 else 0.0
+    return min(_MAX_DENSE_DOFS, max(_CHEAP_DOFS, plane, _MAX_SURFACE_RATIO[dimension] * surface))
 
 
 def inexpensive(n: int, dimension: int) -> int:
-    """How many of ``n`` unknowns cost next to nothing more than fewer when they are retained."""
-    return int(max(_SMALL, _CHEAP * _most(n, dimension)))
+    """Return how many unknowns can be retained at negligible additional cost."""
+    return int(max(_CHEAP_DOFS, _INEXPENSIVE_RATIO * _max_dofs(n, dimension)))
 
 
 def all_retained(n: int, n_touched: int, dimension: int) -> bool:
-    """Whether to keep all that contact touches, whatever part of it may come into contact."""
-    return n_touched <= max(2 * _SMALL, _ALL[dimension] * _most(n, dimension))
+    """Return whether to retain all dofs that the contacts couple, active or not."""
+    return n_touched <= max(2 * _CHEAP_DOFS, _RETAIN_ALL_RATIO[dimension] * _max_dofs(n, dimension))
 
 
 class CondensedSystem(System):
-    """The unknowns that contact touches, on the first rank; all others are eliminated.
+    """The retained unknowns, all on the first rank; the others are condensed.
 
     Args:
-        full: All unknowns of a problem.
-        unknowns: Those that contact touches, or may touch in this increment.
-        prefix: Of the options of the factorisation.
+        full: The system on all unknowns.
+        unknowns: The retained unknowns.
+        prefix: Options prefix of the factorisation.
     """
 
     unknowns: DofSubset
-    # A dense factorisation costs no more than ten iterations. With fewer in a round L-BFGS is
-    # Newton's method without a globalisation, and fails at a stiffness of 100 E/h.
+    # A dense factorisation costs ten iterations. With fewer iterations per round L-BFGS reduces to
+    # Newton's method without globalisation, which fails at a stiffness of 100 E/h.
     iterations_per_round = 8
 
     def __init__(self, full: FullSystem, unknowns: DofSubset, *, prefix: str = "") -> None:
@@ -96,27 +93,27 @@ class CondensedSystem(System):
             unknowns,
             full.bulk,
             full.contacts,
-            unknowns.gathered(full.constrained[retained].astype(np.float64)) > 0.5,
-            unknowns.gathered(full.label[retained].astype(np.float64)).astype(np.intp),
+            unknowns.gather(full.constrained[retained].astype(np.float64)) > 0.5,
+            unknowns.gather(full.label[retained].astype(np.float64)).astype(np.intp),
             full.n_bodies,
         )
         self.ready, self.scales = False, full.scales
         self.coordinate_id = object()
-        self._fixed: Array | None = None  # the constant part of the matrices
+        self._scaled_schur: Array | None = None  # with Dirichlet conditions, dimensionless
         self._full, self._prefix = full, prefix
-        # This rank's dofs among those retained; motions are behind all of them.
+        # The motions are numbered after these dofs.
         self._retained_dofs = retained[retained < unknowns.whole.n_dofs]
         self._condensation: Condensation | None = None
 
     def linear_solver(self, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
-        """That of `prepare`."""
+        """Return the options that `prepare` needs."""
         return {"ksp_type": "preonly"}
 
     def update(self) -> int:
         """Factor and condense the bulk's tangent. Collective."""
         stiffness = self._full.stiffness
         assert stiffness is not None
-        self._condensation = self._fixed = None  # their memory first
+        self._condensation = self._scaled_schur = None  # release the memory first
         self.ready = False
         self._condensation = Condensation(
             stiffness,
@@ -133,29 +130,29 @@ class CondensedSystem(System):
 
     @property
     def condensation(self) -> Condensation:
-        """The stiffness condensed, after `update`."""
+        """The static condensation, after `update`."""
         assert self._condensation is not None
         return self._condensation
 
     def state(self) -> Array:
-        """The present values of the unknowns retained; a copy. Collective."""
+        """Return the retained unknowns, a copy. Collective."""
         whole = self.unknowns.whole
-        mine = whole.joined(self.u.x.array[self._retained_dofs], self.motions())
-        return self.unknowns.gathered(mine)
+        own = whole.joined(self.u.x.array[self._retained_dofs], self.motions())
+        return self.unknowns.gather(own)
 
     def set_state(self, state: Array) -> None:
-        """Set the unknowns retained; the others stay behind until `complete`. Collective."""
-        mine = self.unknowns.scattered(state)
-        self.u.x.array[self._retained_dofs] = mine[: self._retained_dofs.size]
+        """Set the retained unknowns; `complete` recovers the others. Collective."""
+        own = self.unknowns.scatter(state)
+        self.u.x.array[self._retained_dofs] = own[: self._retained_dofs.size]
         self.u.x.scatter_forward()
         self.set_motions(state)
 
     def part(self, state: Array) -> Array:
-        """What of a state of all unknowns is retained. Collective."""
-        return self.unknowns.gathered(state[self.unknowns.retained])
+        """Restrict a state of all unknowns to the retained ones. Collective."""
+        return self.unknowns.gather(state[self.unknowns.retained])
 
     def begin(self, load: Array) -> None:
-        """Condense the load and the values prescribed. Collective."""
+        """Condense the load and the prescribed values. Collective."""
         self._full.begin(load)
         state = self._full.state()
         self.condensation.set_load(load, state)
@@ -167,40 +164,40 @@ class CondensedSystem(System):
         self.outside = self._full.by_body(*outside)
 
     def extended(self, change: Array) -> Array:
-        """One back-substitution; see `System.extended`."""
-        return self.condensation.extended(change)
+        """Extend a change to all unknowns by one back-substitution. Collective."""
+        return self.condensation.extend(change)
 
     @property
     def pending_field(self) -> Array | None:
-        """The fixed-interface solution: eliminated displacements with the retained ones at zero."""
-        return self.condensation.response.field
+        """The fixed-interface solution: all unknowns with the retained ones at zero."""
+        return self.condensation.particular.field
 
     def complete(self, field: Array | None) -> None:
-        """One back-substitution for the unknowns eliminated."""
+        """Recover the eliminated unknowns by one back-substitution. Collective."""
         assert field is not None
-        self._full.set_state(field + self.condensation.extended(self.state()))
+        self._full.set_state(field + self.condensation.extend(self.state()))
 
     def bulk_force(self) -> Array:
-        """S x - g: the residual of the bulk and of free obstacles."""
-        return self.condensation.schur @ self.state() - self.condensation.response.load
+        """Return S x - g, the residual of the bulk and of free obstacles."""
+        return self.condensation.schur @ self.state() - self.condensation.particular.load
 
     def bulk_energy(self) -> float:
-        """Potential of S and g, up to a constant."""
-        load = self.condensation.response.load
+        """Return the potential of S and g, up to a constant."""
+        load = self.condensation.particular.load
         return float(0.5 * (self.bulk_force() - load) @ self.state())
 
     def forces(self, bulk: Array, reaction: Array) -> Forces:
-        """Forces at the retained unknowns, at the field with these at rest, and prescribed values.
+        """Return forces at x, at p and at x again, for the prescribed values.
 
-        With u = N x + p, p the response to the load, and K symmetric, NᵀK p = -g_u is the part of
-        the prescribed values in g, and the products of these forces with differences of these
-        unknowns are those of K u, of the loads and of the reactions with differences of u.
+        With u = N x + p, where p is the solution for the load at x = 0, and K symmetric, NᵀK p =
+        -g_u is the part of g that prescribed values cause. The products of these forces with
+        differences of these unknowns are those of K u, loads and reactions with differences of u.
         """
-        x, response = self.state(), self.condensation.response
-        own = bulk + response.load  # S x
-        internal = [own - response.by_values, response.forces, x]
-        external = [response.load - response.by_values + reaction, response.forces, x]
-        unknowns = [x, response.field, -response.by_values]
+        x, particular = self.state(), self.condensation.particular
+        force = bulk + particular.load  # S x
+        internal = [force - particular.prescribed_load, particular.forces, x]
+        external = [particular.load - particular.prescribed_load + reaction, particular.forces, x]
+        unknowns = [x, particular.field, -particular.prescribed_load]
         labels = np.concatenate([self.label, self._full.label, self.label])
         u, inner, outer = (np.concatenate(part) for part in (unknowns, internal, external))
         return Forces(u, inner, outer, labels)
@@ -211,11 +208,11 @@ class CondensedSystem(System):
         self._full.forget()
         if self._condensation is not None:
             self._condensation.forget()
-            # As `update` leaves it, also at unknowns that no matrix of contact has.
+            # Reset also the entries of unknowns without contact stiffness.
             self._full.diagonal = self._full.bulk_diagonal()
 
     def matrix(self, *, symmetric: bool) -> PETSc.Mat:
-        """A new operator, S and contact side by side."""
+        """Create an operator for the sum of S and the contact tangents."""
         n = self.unknowns.n_local
         size = (n, None)
         matrix = PETSc.Mat().createPython((size, size), Sum(), comm=self.unknowns.comm)
@@ -223,39 +220,39 @@ class CondensedSystem(System):
         return matrix
 
     def prepare(self, ksp: PETSc.KSP, matrix: PETSc.Mat) -> None:
-        """Have a solver factor a matrix of `matrix`, and correct the factors for the next ones."""
+        """Let a solver factor a matrix of `matrix`, with low-rank updates."""
         super().prepare(ksp, matrix)
         ksp.pc.setType("python")
         ksp.pc.setPythonContext(UpdatedLU())
 
     def bulk_diagonal(self) -> Array:
-        """See `System.bulk_diagonal`: that of S."""
+        """Return the diagonal of S (force/length)."""
         return np.asarray(np.diag(self.condensation.schur), dtype=np.float64)
 
     def fill(self, matrix: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> int:
-        """S plus contact, conditions applied, dimensionless; no sparse factorisation."""
+        """Add S and contact tangents with Dirichlet conditions, dimensionless."""
         scale = self.bulk.scale
-        held = np.flatnonzero(self.constrained)
-        fixed = self._fixed
-        if fixed is None:
-            fixed = np.asarray(self.condensation.schur / scale, dtype=np.float64)
-            fixed[held] = fixed[:, held] = 0.0
-            fixed[held, held] = 1.0
-            self._fixed = fixed
+        constrained = np.flatnonzero(self.constrained)
+        schur = self._scaled_schur
+        if schur is None:
+            schur = np.asarray(self.condensation.schur / scale, dtype=np.float64)
+            schur[constrained] = schur[:, constrained] = 0.0
+            schur[constrained, constrained] = 1.0
+            self._scaled_schur = schur
         rows, columns, values = _entries(list(contacts))
         values = np.where(self.constrained[rows] | self.constrained[columns], 0.0, values / scale)
-        matrix.getPythonContext().set_parts(fixed, rows, columns, values)
-        matrix.assemble()  # says that it changed
-        on = rows == columns
-        added = np.bincount(rows[on], values[on], minlength=len(fixed))
+        matrix.getPythonContext().set_parts(schur, rows, columns, values)
+        matrix.assemble()  # increments the state of the Mat
+        on_diagonal = rows == columns
+        added = np.bincount(rows[on_diagonal], values[on_diagonal], minlength=len(schur))
         self.diagonal = self.bulk_diagonal() + scale * added
-        # For the round-off of contact.
-        self._full.diagonal[self.unknowns.retained] = self.unknowns.scattered(self.diagonal)
+        # The round-off of contact forces depends on it.
+        self._full.diagonal[self.unknowns.retained] = self.unknowns.scatter(self.diagonal)
         return 0
 
 
 def _entries(parts: Sequence[PETSc.Mat]) -> tuple[Indices, Indices, Array]:
-    """Rows, columns and values of the sum of matrices, which are used up."""
+    """Return rows, columns and values of the sum of matrices, which are destroyed."""
     if not parts:
         return np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32), np.zeros(0)
     total, *others = parts

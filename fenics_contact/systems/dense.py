@@ -1,6 +1,6 @@
-"""Solver for dense matrices S + C of which C changes, mostly at some of the unknowns only.
+"""Direct solver for dense matrices S + C, of which C changes mostly at few unknowns.
 
-All of it is on the first rank; the others have no unknowns, and wait.
+All unknowns are on the first rank.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from fenics_contact.types import Array, Index
 __all__ = ["Sum", "UpdatedLU", "raise_stored_error"]
 
 
-# Share of the unknowns up to which a change of C is a correction to the last factors.
-_CORRECTED = 0.25
-# Residual, relative, that a corrected solution may have before all is factored.
-_ACCURATE = 1e-11
+# Largest ratio of changed unknowns to all up to which the factors are updated.
+_MAX_UPDATE_RATIO = 0.25
+# Relative residual of an updated solution above which all is factored anew.
+_UPDATE_RTOL = 1e-11
 
 
 class Sum:
@@ -28,33 +28,29 @@ class Sum:
 
     Attributes:
         fixed: S, (n, n).
-        added: Rows, columns and values of C's entries.
-        error: What `mult` ran into: PETSc carries no exception; see `raise_stored_error`.
+        added: Rows, columns and values of the entries of C.
+        error: Exception in `mult`, which PETSc does not propagate; see `raise_stored_error`.
     """
 
     def __init__(self) -> None:
         self.error: BaseException | None = None
         self.fixed: Array = np.zeros((0, 0))
-        nothing = np.zeros(0, dtype=np.intp)
-        self.added: tuple[Index, Index, Array] = nothing, nothing, np.zeros(0)
+        empty = np.zeros(0, dtype=np.intp)
+        self.added: tuple[Index, Index, Array] = empty, empty, np.zeros(0)
 
     def set_parts(self, fixed: Array, rows: Index, columns: Index, values: Array) -> None:
-        """Say what the operator is; afterwards assemble the Mat, that its PC sees it.
+        """Set S, (n, n), and the entries of C, each at most once; then assemble the Mat.
 
-        Args:
-            fixed: S, (n, n): the same array as before as long as S is the same.
-            rows: Of C's entries, each place at most once.
-            columns: Likewise.
-            values: The entries.
+        An unchanged S must be the same array. The assembly lets PETSc set up the PC again.
         """
         self.fixed, self.added = fixed, (rows, columns, values)
 
     def mult(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Multiply; into what is no number if that fails."""
+        """Multiply by S + C; the result is NaN after an exception."""
         self._multiply(x, y, transposed=False)
 
     def multTranspose(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Multiply by the transpose, as SNES of trust regions does; likewise."""
+        """Multiply by the transpose, which SNES needs for trust regions."""
         self._multiply(x, y, transposed=True)
 
     def _multiply(self, x: PETSc.Vec, y: PETSc.Vec, *, transposed: bool) -> None:
@@ -65,7 +61,7 @@ class Sum:
             y.set(np.nan)
 
     def product(self, state: Array, *, transposed: bool = False) -> Array:
-        """(S + C) times a vector, or Sᵀ + Cᵀ, (n,)."""
+        """Return (S + C) times a vector, or (S + C)ᵀ times it, (n,)."""
         fixed, (rows, columns, values) = self.fixed, self.added
         if transposed:
             fixed, rows, columns = fixed.T, columns, rows
@@ -74,47 +70,47 @@ class Sum:
 
 
 class UpdatedLU:
-    """Context of the PC of a `Sum`: LU of all, corrected where C changes at few unknowns.
+    """Context of the PC of a `Sum`: an LU factorisation with low-rank updates.
 
-    From one iteration to the next a few points change between open, stick and slip. With E the
-    unknowns that they reach and D the change of C there, the columns of (S + C)⁻¹ for E and a
-    system as large as E make the solutions of S + C + D (Woodbury's identity).
+    Between iterations few points change their status. With D the change of C at the unknowns E, the
+    columns of (S + C)⁻¹ at E and a system of the size of E give the solution for S + C + D
+    (Woodbury's identity).
 
     Attributes:
-        error: As of `Sum`.
+        error: Exception in a callback, which PETSc does not propagate; see `raise_stored_error`.
     """
 
     def __init__(self) -> None:
         self.error: BaseException | None = None
         self._operator = Sum()
-        nothing: Array = np.zeros((0, 0))
-        none: Index = np.zeros(0, dtype=np.intp)
-        # LU of S + C, which S, and the entries of which C.
-        self._factor = nothing, none
+        empty: Array = np.zeros((0, 0))
+        no_dofs: Index = np.zeros(0, dtype=np.intp)
+        # LU factors of S + C; S, and rows, columns and values of C at that time.
+        self._factor = empty, no_dofs
         self._factored: tuple[Array, Index, Index, Array] | None = None
-        # Columns of the inverse, and of which unknowns; of these those that have changed since, the
-        # change, and LU of the system that corrects by it.
-        self._known, self._changed = none, none
-        self._columns, self._answers, self._change = nothing, nothing, nothing
-        self._core = nothing, none
+        # Numbers of the known columns of the inverse and of the changed unknowns; these columns,
+        # those of the changed unknowns, the change D, and LU factors of I + (S + C)⁻¹ D at E.
+        self._column_dofs, self._changed_dofs = no_dofs, no_dofs
+        self._columns, self._changed_columns, self._change = empty, empty, empty
+        self._core = empty, no_dofs
 
     def raise_stored_error(self) -> None:
-        """Raise what this, or the operator, ran into when PETSc called it last."""
+        """Raise the exception of the last callback here or in the operator."""
         for part in (self, self._operator):
             error, part.error = part.error, None
             try:
                 if error is not None:
                     raise error
             finally:
-                del error  # it keeps this frame, which would keep it and all that solves
+                del error  # breaks the cycle of traceback and frame
 
     def setUp(self, pc: PETSc.PC) -> None:
-        """Factor, or find out what the last factors lack."""
+        """Update the factors, or factor anew."""
         reasons = PETSc.PC.FailedReason
         self._operator = pc.getOperators()[1].getPythonContext()
         try:
-            # Other ranks have no unknowns.
-            regular = not len(self._operator.fixed) or self._correct() or self.factor_anew()
+            # Only the first rank has unknowns.
+            regular = not len(self._operator.fixed) or self._update_low_rank() or self.factor_anew()
         except BaseException as error:
             self.error, regular = self.error or error, False
             self._factored = None
@@ -122,19 +118,19 @@ class UpdatedLU:
         pc.setFailedReason(reasons.NOERROR if regular else reasons.FACTOR_NUMERIC_ZEROPIVOT)
 
     def factor_anew(self) -> bool:
-        """Factor S + C as it is now; whether it is regular."""
+        """Factor S + C; return whether it is regular."""
         fixed, (rows, columns, values) = self._operator.fixed, self._operator.added
         whole = fixed.copy(order="F")
         whole[rows, columns] += values
-        self._factor = _factors(whole)
+        self._factor = _factor_lu(whole)
         regular = bool(np.all(np.diag(self._factor[0])))
         self._factored = (fixed, rows, columns, values) if regular else None
-        self._changed = self._known = np.zeros(0, dtype=np.intp)
+        self._changed_dofs = self._column_dofs = np.zeros(0, dtype=np.intp)
         self._columns = np.zeros((len(fixed), 0))
         return regular
 
-    def _correct(self) -> bool:
-        """Find the change since the last factorisation, if it is of few unknowns; whether it is."""
+    def _update_low_rank(self) -> bool:
+        """Update the solution by the change of C if it has low rank; return whether it does."""
         if self._factored is None:
             return False
         fixed, *places, factored = self._factored
@@ -144,61 +140,60 @@ class UpdatedLU:
         ):
             return False
         change = values - factored
-        matters = change != 0.0
-        rows, columns = rows[matters], columns[matters]
-        reached = np.union1d(rows, columns)
-        new = np.setdiff1d(reached, self._known)
-        if self._known.size + new.size > _CORRECTED * len(fixed):
+        is_changed = change != 0.0
+        rows, columns = rows[is_changed], columns[is_changed]
+        dofs = np.union1d(rows, columns)
+        new = np.setdiff1d(dofs, self._column_dofs)
+        if self._column_dofs.size + new.size > _MAX_UPDATE_RATIO * len(fixed):
             return False
         unit = np.zeros((len(fixed), new.size), order="F")
         unit[new, np.arange(new.size)] = 1.0
-        made = scipy.linalg.lu_solve(self._factor, unit, overwrite_b=True, check_finite=False)
-        self._columns = np.hstack([self._columns, made])
-        self._known = np.concatenate([self._known, new])
-        order = np.argsort(self._known)
-        among = order[np.searchsorted(self._known, reached, sorter=order)]
-        self._changed, self._answers = reached, self._columns[:, among]
-        self._change = np.zeros((reached.size, reached.size))
-        at = np.searchsorted(reached, rows), np.searchsorted(reached, columns)
-        self._change[at] = change[matters]
-        self._core = _factors(np.eye(reached.size) + self._answers[reached] @ self._change)
+        solved = scipy.linalg.lu_solve(self._factor, unit, overwrite_b=True, check_finite=False)
+        self._columns = np.hstack([self._columns, solved])
+        self._column_dofs = np.concatenate([self._column_dofs, new])
+        order = np.argsort(self._column_dofs)
+        indices = order[np.searchsorted(self._column_dofs, dofs, sorter=order)]
+        self._changed_dofs, self._changed_columns = dofs, self._columns[:, indices]
+        self._change = np.zeros((dofs.size, dofs.size))
+        position = np.searchsorted(dofs, rows), np.searchsorted(dofs, columns)
+        self._change[position] = change[is_changed]
+        self._core = _factor_lu(np.eye(dofs.size) + self._changed_columns[dofs] @ self._change)
         return bool(np.all(np.diag(self._core[0])))
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Solve; with what is no number if that fails."""
+        """Solve; the result is NaN after an exception."""
         try:
             if y.array.size:
                 y.array[:] = self._solve(x.array_r)
         except BaseException as error:
-            self.error = self.error or error  # PETSc may go on for a while
+            self.error = self.error or error  # PETSc may call again
             y.set(np.nan)
 
     def _solve(self, right: Array) -> Array:
-        """Solve, and look whether a correction was good enough."""
+        """Solve, and factor anew if the residual of an updated solution is too large."""
         solution = scipy.linalg.lu_solve(self._factor, right, check_finite=False)
-        if not self._changed.size:
+        if not self._changed_dofs.size:
             return solution
-        at_changed = scipy.linalg.lu_solve(self._core, solution[self._changed], check_finite=False)
-        solution -= self._answers @ (self._change @ at_changed)
-        left = right - self._operator.product(solution)
-        if not np.linalg.norm(left) <= _ACCURATE * np.linalg.norm(right):
+        at_changed = scipy.linalg.lu_solve(
+            self._core, solution[self._changed_dofs], check_finite=False
+        )
+        solution -= self._changed_columns @ (self._change @ at_changed)
+        residual = right - self._operator.product(solution)
+        if not np.linalg.norm(residual) <= _UPDATE_RTOL * np.linalg.norm(right):
             self.factor_anew()
             return scipy.linalg.lu_solve(self._factor, right, check_finite=False)
         return solution
 
 
-def _factors(matrix: Array) -> tuple[Array, Index]:
-    """LU of a matrix, which is used up; a zero pivot is looked for by the caller."""
+def _factor_lu(matrix: Array) -> tuple[Array, Index]:
+    """Return the LU factors of a matrix, which is overwritten; zero pivots are not reported."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
         return scipy.linalg.lu_factor(matrix, overwrite_a=True, check_finite=False)
 
 
 def raise_stored_error(ksp: PETSc.KSP) -> None:
-    """Raise what the contexts of a solver ran into when PETSc called them last, if it has any.
-
-    Collective: all ranks raise what one has.
-    """
+    """Raise the exception that a Python context of a solver stored, on all ranks. Collective."""
     context = ksp.getPC().getPythonContext() if ksp.getPC().getType() == "python" else None
     if isinstance(context, UpdatedLU):
         with collective_errors(ksp.comm.tompi4py()):

@@ -1,4 +1,4 @@
-"""Forces at one state, from which energies follow."""
+"""Internal and external forces at one state, from which energies are computed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["Forces"]
 
 @dataclass(frozen=True)
 class Forces:
-    """Forces at one state, in coordinates of which the unknowns of all states are.
+    """Internal and external forces at one state, in the coordinates of the unknowns.
 
     Attributes:
         unknowns: Displacements and free motions on this rank.
@@ -28,5 +28,5 @@ class Forces:
 
     @classmethod
     def none(cls, unknowns: Array, label: Index) -> Forces:
-        """No forces."""
+        """Return zero forces at a state."""
         return cls(unknowns, np.zeros_like(unknowns), np.zeros_like(unknowns), label)

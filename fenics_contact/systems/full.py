@@ -27,13 +27,13 @@ __all__ = ["FullSystem"]
 
 
 class FullSystem(System):
-    """All unknowns: the dofs of what is solved for and the free motions of obstacles.
+    """All unknowns: the dofs of the solution function and the free motions of obstacles.
 
     Attributes:
         bcs: Dirichlet conditions.
-        body: Body of every node of this rank, its ghosts last.
-        displacement: What of it is one.
-        stiffness: The bulk's tangent over all unknowns, after `update_stiffness`.
+        body: Body of every node of this rank, ghosts last.
+        displacement: The displacement within the solution function.
+        stiffness: Tangent of the bulk over all unknowns, after `update_stiffness`.
     """
 
     coordinate_id: object = "all unknowns"
@@ -53,7 +53,7 @@ class FullSystem(System):
         n, body = connected_bodies(space)
         n_motions = sum(len(contact.motions) for contact in contacts)
         dofs = np.repeat(body, space.dofmap.bs)[: unknowns.n_dofs]
-        if displacement.mixed:  # that of the cells around
+        if displacement.mixed:  # by the adjacent cells
             label = np.zeros(u.x.array.size, dtype=body.dtype)
             label[u.function_space.dofmap.list] = body[space.dofmap.list[:, :1]]
             dofs = label[: unknowns.n_dofs]
@@ -61,46 +61,48 @@ class FullSystem(System):
         motions = (n + np.arange(n_motions)).astype(np.float64)
         label = unknowns.joined(dofs.astype(np.float64), motions).astype(np.intp)
         super().__init__(u, unknowns, bulk, contacts, constrained, label, n + n_motions)
-        moves = displacement.within(np.ones(displacement.n_owned))
-        self._moves: Mask = unknowns.joined(moves, np.ones(n_motions)) > 0
-        self.scales = ReferenceScales(displacement, body, label, self._moves, n_motions, contacts)
+        mask = displacement.within(np.ones(displacement.n_owned))
+        self._is_displacement: Mask = unknowns.joined(mask, np.ones(n_motions)) > 0
+        self.scales = ReferenceScales(
+            displacement, body, label, self._is_displacement, n_motions, contacts
+        )
         self.stiffness: PETSc.Mat | None = None
         self._near_nullspace: PETSc.NullSpace | None = None
         self.body = body
 
     @property
     def iterations_per_round(self) -> int:
-        """See `System`. Pairs of L-BFGS taken across changes of status are worth little.
+        """Iterations of L-BFGS between two assemblies of H₀.
 
-        An iteration costs 1/15 to 1/35 of a factorisation, but several times as much as it takes
-        the levels of multigrid to follow.
+        Pairs from before a change of status help little. An iteration costs 1/15 to 1/35 of a
+        factorisation, but several times as much as an update of the multigrid levels.
         """
         return 10 if self.linear_kind == "multigrid" else 20
 
     @cached_property
     def size_to_factor(self) -> float:
-        """`linear.cube_size` of the bodies; in the plane the unknowns. Collective at first."""
+        """`linear.cube_size` of the bodies, in the plane the number of dofs. Collective."""
         if self.gdim != 3:
             return self.unknowns.first_motion
         return linear.cube_size(self.displacement.u.function_space, self.body)
 
     def update_stiffness(self) -> bool:
-        """Assemble the bulk's tangent if it may have changed; True if it did. Collective."""
+        """Assemble the bulk tangent if it may have changed; return whether it was. Collective."""
         changed = self.bulk.update()
         if self.stiffness is None or (changed and self.unknowns.n_motions):
             if self.stiffness is not None:
                 self.stiffness.destroy()
-            self.stiffness = self.unknowns.widened(self.bulk.stiffness, rows=True)
+            self.stiffness = self.unknowns.widen(self.bulk.stiffness, rows=True)
         return changed
 
     @contextmanager
     def stiffness_at_rest(self) -> Iterator[PETSc.Mat]:
-        """The bulk's tangent at u = 0 over all unknowns, with the present data. Collective."""
+        """Yield the bulk tangent at u = 0 over all unknowns. Collective."""
         with self.bulk.stiffness_at_rest() as stiffness:
-            yield self.unknowns.widened(stiffness, rows=True)
+            yield self.unknowns.widen(stiffness, rows=True)
 
     def state(self) -> Array:
-        """The present unknowns of this rank; a copy."""
+        """Return the present unknowns of this rank, a copy."""
         values = self.bulk.in_units(self.u.x.array[: self.unknowns.n_dofs])
         return self.unknowns.joined(values, self.motions()) if self.unknowns.n_motions else values
 
@@ -119,13 +121,13 @@ class FullSystem(System):
         )
 
     def prescribe(self) -> None:
-        """Give u the present values of the Dirichlet conditions. Collective."""
+        """Set the Dirichlet values in u. Collective."""
         for bc in self.bcs:
             bc.set(self.u.x.array)
         self.u.x.scatter_forward()
 
     def set_state(self, state: Array) -> None:
-        """Make a state the present one. Collective."""
+        """Set the present unknowns. Collective."""
         n = self.unknowns.n_dofs
         self.u.x.array[:n] = self.bulk.from_units(state[:n])
         self.u.x.scatter_forward()
@@ -133,7 +135,7 @@ class FullSystem(System):
         self.set_motions(state)
 
     def evaluate_at(self, state: Array) -> None:
-        """Make a state the present one, and evaluate the contacts there. Collective."""
+        """Set the present unknowns and evaluate the contacts. Collective."""
         self.set_state(state)
         self.evaluate()
 
@@ -143,7 +145,7 @@ class FullSystem(System):
             contact.evaluate()
 
     def displacement_at(self, state: Array) -> fem.Function:
-        """The displacement of a state of this rank's unknowns, a copy. Collective."""
+        """Return the displacement of a state as a new function. Collective."""
         n = self.unknowns.n_dofs
         whole = fem.Function(self.u.function_space)
         whole.x.array[:n] = self.bulk.from_units(state[:n])
@@ -156,43 +158,44 @@ class FullSystem(System):
 
     @cached_property
     def _cell_size(self) -> float:
-        """Of the largest cell (length). Collective at first."""
+        """Size of the largest cell (length). Collective."""
         mesh = self.u.function_space.mesh
         cells = np.arange(mesh.topology.index_map(mesh.topology.dim).size_local, dtype=np.int32)
         return global_max(mesh.comm, mesh.h(mesh.topology.dim, cells))
 
     def terms(self, state: Array) -> Array:
-        """See `System.terms`; a constraint on displacements sums up these. Collective.
+        """Return the magnitude of the terms of K u, (n_local,) (force). Collective.
 
-        A bulk that is not linear sums up I + ∇u, with the round-off of 1 in a body at rest, too.
+        A nonlinear bulk evaluates I + ∇u, whose round-off is that of 1 even at rest. The equations
+        of other fields, such as an incompressibility constraint, sum up displacements.
         """
         terms = super().terms(state)
         if not self.bulk.linear:
             terms = terms + self.diagonal * self._cell_size
         if not self.displacement.mixed:
             return terms
-        moved = global_max(self.unknowns.comm, np.abs(state[self._moves]))
-        return np.where(self._moves, terms, self.bulk.scale * moved)
+        largest = global_max(self.unknowns.comm, np.abs(state[self._is_displacement]))
+        return np.where(self._is_displacement, terms, self.bulk.scale * largest)
 
     def begin(self, load: Array) -> None:
-        """Start an increment under a load, u with its conditions. Collective."""
+        """Start an increment under a load, with the Dirichlet values in u. Collective."""
         self.load = load
         self.prescribed = self.state()[self.constrained]
 
     def forces(self, bulk: Array, reaction: Array) -> Forces:
-        """Forces at all unknowns; see `System.forces`."""
+        """Return the forces at all unknowns."""
         return Forces(self.state(), bulk + self.load, self.load + reaction, self.label)
 
     def forget(self) -> None:
-        """Drop the diagonal, whose round-off is allowed for."""
+        """Reset the diagonal, from which round-off is estimated."""
         self.diagonal[:] = 0.0
 
     def bulk_force(self) -> Array:
-        """The residual of the bulk, and the forces on free obstacles. Collective."""
+        """Return the residual of the bulk and of free obstacles. Collective."""
         return self.with_obstacles(self.bulk.residual())
 
     def product_force(self) -> Array:
-        """The same by the bulk's matrix, if it is linear: K u less the loads. Collective."""
+        """Return K u minus the loads, for a linear bulk. Collective."""
         assert self.stiffness is not None
         state, image = self.unknowns.vector(), self.unknowns.vector()
         state.array[:] = self.state()
@@ -203,21 +206,20 @@ class FullSystem(System):
         return force
 
     def bulk_energy(self) -> float:
-        """This rank's part of the potential of a linear bulk and its loads, up to a constant."""
-        # F(u) = K u + F(0), so that it is (F(u) + F(0))·u/2.
+        """Return this rank's potential of a linear bulk and its loads, up to a constant."""
+        # The potential is (F(u) + F(0))·u/2, since F(u) = K u + F(0).
         return float(0.5 * (self.bulk_force() - self.load) @ self.state())
 
     def with_obstacles(self, residual: Array) -> Array:
-        """A residual over the dofs with that of the free obstacles, which their forces are."""
+        """Append the residual of the free obstacles, minus their loads, to one of the dofs."""
         forces = [motion.force for c in self.contacts for motion in c.motions]
         return self.unknowns.joined(residual, -np.array(forces))
 
     def contact_force_sizes(self, *, committed: bool = False) -> Array:
-        """Sums of the sizes of contact forces, now or committed, (n_groups,) (force). Collective.
+        """Sum the magnitudes of contact forces by group, (n_groups,) (force). Collective.
 
-        By group of coupled parts; see `ReferenceScales.group`. Not their resultants: those of a
-        body that friction has locked are zero. With finite kinematics an obstacle that moves away
-        leaves nothing of the forces.
+        The groups are those of `ReferenceScales.group`. Resultants are no measure: those of a body
+        that is locked by friction vanish. ``committed`` selects the committed forces.
         """
         total: Array = np.zeros(self.scales.n_groups)
         for number, contact in enumerate(self.contacts):
@@ -229,22 +231,22 @@ class FullSystem(System):
 
     @property
     def follows(self) -> bool:
-        """Whether pairs of any contact follow the bodies."""
+        """Whether the pairs of a contact are updated with the displacement."""
         return any(contact.contact_kinematics.follows for contact in self.contacts)
 
     @property
     def pattern_changes(self) -> bool:
-        """Whether what `fill` makes has another pattern each time.
+        """Whether the sparsity pattern of `fill` changes from one matrix to the next.
 
-        So it has where pairs follow the bodies, and where a factorisation is to have no more to do
-        than what contact couples now. In space open points that count as coupled cost up to half of
-        it, a new pattern a tenth; in the plane that is the larger part.
+        It does if pairs are updated, and in three dimensions where contact couples bodies and the
+        matrix is factored. Coupling open points there costs up to half a factorisation, a new
+        pattern a tenth; in the plane it is the other way round.
         """
-        couples = self.gdim == 3 and any(_couples(c) for c in self.contacts)
+        couples = self.gdim == 3 and any(_has_coupling(c) for c in self.contacts)
         return self.follows or (couples and self.linear_kind == "direct")
 
     def matrix(self, *, symmetric: bool) -> PETSc.Mat:
-        """A new matrix for `fill`. Collective.
+        """Create a matrix for `fill`. Collective.
 
         Its pattern is that of the bulk and, with deformable or moving obstacles, of the pairs.
         """
@@ -252,13 +254,13 @@ class FullSystem(System):
         different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
         matrix = self.stiffness.copy()
         for operator in self.operators:
-            if _couples(operator.contact) and not self.pattern_changes:
+            if _has_coupling(operator.contact) and not self.pattern_changes:
                 part = operator.springs(operator.contact.values.springs(1.0, 1.0))
                 matrix.axpy(1.0, part, different)
                 part.destroy()
         matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
-        # Not where obstacles move freely, or pressures are unknown, too.
+        # Rigid-body modes of obstacles and pressures are not treated.
         if matrix.getBlockSize() == self.gdim and not self.displacement.mixed:
             if self._near_nullspace is None:
                 self._near_nullspace = linear.near_nullspace(self.u.function_space)
@@ -266,11 +268,11 @@ class FullSystem(System):
         return matrix
 
     def linear_solver(self, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
-        """Options of the solver for `matrix`; see `linear.options`."""
+        """Return the options of the solver for `matrix`."""
         return linear.options(self.linear_kind, symmetric=symmetric, accurate=accurate)
 
     def fill(self, matrix: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> int:
-        """Bulk tangent plus contact, conditions applied, dimensionless; see `System.fill`."""
+        """Add bulk and contact tangents with Dirichlet conditions, dimensionless. Collective."""
         assert self.stiffness is not None
         if self.pattern_changes:
             different = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
@@ -282,7 +284,7 @@ class FullSystem(System):
             total.destroy()
         else:
             subset = PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN
-            if any(_couples(c) for c in self.contacts):
+            if any(_has_coupling(c) for c in self.contacts):
                 matrix.zeroEntries()
                 matrix.axpy(1.0, self.stiffness, subset)
             else:
@@ -293,25 +295,25 @@ class FullSystem(System):
         start, _ = matrix.getOwnershipRange()
         rows = (start + np.flatnonzero(self.constrained)).astype(PETSc.IntType)
         scale = self.bulk.scale
-        # Before the conditions, whose rows are as large as the stiffest body's.
+        # Before the Dirichlet rows, whose entries are of the stiffest body.
         self.diagonal = _diagonal(matrix)
         matrix.zeroRowsColumns(rows, diag=scale)
         matrix.scale(1.0 / scale)
         return int(self.linear_kind == "direct")
 
     def bulk_diagonal(self) -> Array:
-        """See `System.bulk_diagonal`."""
+        """Return the diagonal of the bulk tangent at this rank's unknowns (force/length)."""
         assert self.stiffness is not None
         return _diagonal(self.stiffness)
 
 
-def _couples(contact: Contact) -> bool:
-    """Whether a contact couples unknowns that the bulk does not couple."""
+def _has_coupling(contact: Contact) -> bool:
+    """Return whether a contact couples unknowns that the bulk does not couple."""
     return not contact.rigid or bool(contact.motions)
 
 
 def _diagonal(matrix: PETSc.Mat) -> Array:
-    """Of this rank's rows; a copy. Collective."""
+    """Return the diagonal of this rank's rows, a copy. Collective."""
     diagonal = matrix.getDiagonal()
     values: Array = diagonal.array.copy()
     diagonal.destroy()

@@ -1,8 +1,7 @@
-"""The least rigid-body motion by which bodies keep, or get, out of each other.
+"""The least rigid-body motion that removes or prevents penetration of bodies.
 
-Of all motions that leave no gap negative it is the one with the least mean square displacement of
-the nodes, in which bodies turn only where they have to: a least-distance problem, with one
-solution, whatever the axes are. Gaps are taken to be linear in the motions.
+Of all motions without negative linearised gaps it has the least mean square displacement of the
+nodes. The solution of this least-distance problem is unique and independent of the axes.
 """
 
 from __future__ import annotations
@@ -22,12 +21,12 @@ from fenics_contact.types import Array, Mask
 
 __all__ = ["find_least_motion", "minimise_norm"]
 
-# A least-distance problem with a solution this many times as long as its limits counts as one
-# without: the residual that tells is round-off.
-_LONGEST = 1e6
-# Weight of a turn, by that of the mean square displacement it makes. By the latter alone a body
-# that is held at a side, and led along with it, would turn to leave its other side behind.
-_TURNING = 1e6
+# A solution longer than this relative to its limits counts as infeasible: the residual is
+# round-off.
+_MAX_LENGTH_RATIO = 1e6
+# Weight of rotations relative to their mean square displacement. Without it a body pulled along at
+# one side would rotate.
+_ROTATION_WEIGHT = 1e6
 
 
 def find_least_motion(
@@ -39,54 +38,52 @@ def find_least_motion(
     among: Sequence[Mask],
     closed: Sequence[Array] | None = None,
 ) -> Array | None:
-    """Find by how much modes are to change, so that the motion is least and no gap is negative.
-
-    Collective.
+    """Find the change of modes for the least motion without negative gaps. Collective.
 
     Args:
-        full: The system, at the state from which they change.
+        full: The system, at the state to change.
         motions: The rigid-body modes.
-        modes: Those that may change, in free motions, (n_modes, n_free).
-        states: Of every contact the values at its points there.
-        displacement: The motion made by then, in free motions, (n_free,) (length).
+        modes: Modes that may change, in free motions, (n_modes, n_free).
+        states: Values at the points of every contact at that state.
+        displacement: Motion since the reference state, in free motions, (n_free,) (length).
         among: Masks of the points that count, (n_points,) each.
-        closed: By how much gaps are smaller by now than in ``states``, (n_points,) each (length).
+        closed: Reduction of the gaps since ``states``, (n_points,) each (length).
 
     Returns:
-        Change in free motions, (n_free,) (length); None: none leaves no gap negative.
+        Change in free motions, (n_free,) (length); None if the constraints are infeasible.
     """
     comm, scales = full.unknowns.comm, full.scales
     fields, at_points = motions.present(full.operators)
     rows = [np.zeros((0, len(modes) + 1))]
     closed = closed or [np.zeros(len(values.gap)) for values in states]
     points = zip(full.operators, at_points, states, among, closed, strict=True)
-    for number, (operator, jumps, values, mine, less) in enumerate(points):
+    for number, (operator, jumps, values, mask, reduction) in enumerate(points):
         size = scales.size_at_points(number)
         normal = np.where(np.isfinite(values.normal), values.normal, 0.0)
         closing = np.einsum("mqd,qd->qm", np.tensordot(modes, jumps, axes=1), normal)
-        gap = values.gap - less
-        felt = mine & (values.paired > 0) & np.isfinite(gap)
-        felt &= np.abs(closing).max(axis=1, initial=0.0) > NEGLIGIBLE
-        felt &= operator.contact.law.has_normal_stiffness
-        # A gap is left, so that round-off is no force; touching points are as near as they are.
-        touches = (gap <= NEGLIGIBLE * size) & (gap >= -ROUND_OFF * size)
-        limit = np.where(touches, 0.0, gap - NEGLIGIBLE * size)
-        rows.append(np.column_stack([closing, limit])[felt])
+        gap = values.gap - reduction
+        is_coupled = mask & (values.paired > 0) & np.isfinite(gap)
+        is_coupled &= np.abs(closing).max(axis=1, initial=0.0) > NEGLIGIBLE
+        is_coupled &= operator.contact.law.has_normal_stiffness
+        # A small gap remains, so that round-off causes no contact force.
+        is_touching = (gap <= NEGLIGIBLE * size) & (gap >= -ROUND_OFF * size)
+        limit = np.where(is_touching, 0.0, gap - NEGLIGIBLE * size)
+        rows.append(np.column_stack([closing, limit])[is_coupled])
     limits = gather_rows(comm, np.concatenate(rows))
     mass = global_sum(comm, fields @ fields.T)
     turns = motions.free * (motions.turns > 0.0)
-    norm = modes @ (mass + _TURNING * mass.max() * turns @ turns.T)
-    found = minimise_norm(norm @ modes.T, norm @ displacement, limits[:, :-1], limits[:, -1])
-    found = broadcast_from_root(comm, found)
-    return None if found is None else np.asarray(found @ modes, dtype=np.float64)
+    norm = modes @ (mass + _ROTATION_WEIGHT * mass.max() * turns @ turns.T)
+    change = minimise_norm(norm @ modes.T, norm @ displacement, limits[:, :-1], limits[:, -1])
+    change = broadcast_from_root(comm, change)
+    return None if change is None else np.asarray(change @ modes, dtype=np.float64)
 
 
 def minimise_norm(norm: Array, linear: Array, matrix: Array, limit: Array) -> Array | None:
-    """Minimise x @ norm @ x / 2 + linear @ x where matrix @ x <= limit.
+    """Minimise x @ norm @ x / 2 + linear @ x subject to matrix @ x <= limit.
 
-    With a growing set of rows, each time the one that is exceeded most. For those the dual of this
-    least-distance problem is one of non-negative least squares (C. L. Lawson and R. J. Hanson,
-    Solving Least Squares Problems, chapter 23).
+    The active set grows by the most violated row. The dual of its least-distance problem is one of
+    non-negative least squares (C. L. Lawson and R. J. Hanson, Solving Least Squares Problems,
+    chapter 23).
 
     Args:
         norm: Symmetric, positive definite, (n, n).
@@ -95,35 +92,38 @@ def minimise_norm(norm: Array, linear: Array, matrix: Array, limit: Array) -> Ar
         limit: (n_rows,).
 
     Returns:
-        Array (n,); None: there is no such x.
+        Array (n,); None if the constraints are infeasible.
     """
     lower = np.linalg.cholesky(norm)
     best = -scipy.linalg.cho_solve((lower, True), linear)
-    # Of z, with x = best + lower.T^-1 z: rows @ z <= ends.
+    # In terms of z, with x = best + lower.T^-1 z: rows @ z <= ends.
     rows = scipy.linalg.solve_triangular(lower, matrix.T, lower=True).T
     size = np.linalg.norm(rows, axis=1)
-    some = size > 0.0
-    rows, ends = rows[some] / size[some, None], (limit - matrix @ best)[some] / size[some]
-    far = -ends.min(initial=0.0)
+    keep = size > 0.0
+    rows, ends = rows[keep] / size[keep, None], (limit - matrix @ best)[keep] / size[keep]
+    scale = -ends.min(initial=0.0)
     z: Array = np.zeros(len(best))
     chosen: list[int] = []
-    while len(rows) and far > 0.0:
+    while len(rows) and scale > 0.0:
         exceeded = rows @ z - ends
-        worst = int(np.argmax(exceeded))
-        if exceeded[worst] <= ROUND_OFF * max(far, float(np.abs(z).max())):
+        row = int(np.argmax(exceeded))
+        if exceeded[row] <= ROUND_OFF * max(scale, float(np.abs(z).max())):
             break
-        if worst in chosen:
+        if row in chosen:
             return None
-        chosen.append(worst)
-        dual = np.vstack([-rows[chosen].T, -ends[chosen] / far])
+        chosen.append(row)
+        dual = np.vstack([-rows[chosen].T, -ends[chosen] / scale])
         target = np.append(np.zeros(len(z)), 1.0)
-        # SciPy's `nnls` ends before the least squares are reached (version 1.15).
+        # `scipy.optimize.nnls` may stop too early (version 1.15).
         force = scipy.optimize.lsq_linear(dual, target, (0.0, np.inf), method="bvls", tol=1e-15).x
-        left = dual @ force - target
-        if not -left[-1] * _LONGEST**2 > 1.0:
+        residual = dual @ force - target
+        if not -residual[-1] * _MAX_LENGTH_RATIO**2 > 1.0:
             return None
-        # It tells which rows are met with equality, of which the nearest solution is more exact.
-        met = np.array(chosen)[force > FLAT * force.max()]
-        found = [-far * left[:-1] / left[-1], np.linalg.lstsq(rows[met], ends[met], rcond=None)[0]]
-        z = min(found, key=lambda way: float((rows[chosen] @ way - ends[chosen]).max()))
+        # Least squares on the active rows is more accurate.
+        active = np.array(chosen)[force > FLAT * force.max()]
+        trials = [
+            -scale * residual[:-1] / residual[-1],
+            np.linalg.lstsq(rows[active], ends[active], rcond=None)[0],
+        ]
+        z = min(trials, key=lambda x: float((rows[chosen] @ x - ends[chosen]).max()))
     return np.asarray(best + scipy.linalg.solve_triangular(lower.T, z), dtype=np.float64)

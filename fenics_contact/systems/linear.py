@@ -1,13 +1,12 @@
-"""How systems over all unknowns are solved: by factorisation or by multigrid, and what that takes.
+"""Solvers for systems over all unknowns: factorisation or multigrid, their memory and cost.
 
-A factorisation (MUMPS) solves anything, at a cost and memory that grow faster than the number of
-unknowns: in three dimensions as n² and n^(4/3). Multigrid by smoothed aggregation (PETSc's GAMG),
-told of the rigid motions that hardly any stiffness resists, costs and takes memory as n.
+A factorisation by MUMPS is robust; in three dimensions its cost grows as n² and its memory as
+n^(4/3). Both grow as n for smoothed aggregation (PETSc's GAMG) with the rigid-body modes as near
+nullspace.
 
-L-BFGS takes a single V-cycle for H₀: a linear map that does not change, as H₀ has to be. The pairs
-learn what it leaves of the error, which a Krylov method inside would remove by more V-cycles than
-L-BFGS has iterations (ball on a block, 15,000 unknowns: 65 V-cycles with Jacobi smoothing, against
-95 by conjugate gradients to 1e-1 and 190 to 1e-2). Newton's method needs the Krylov method, to a
+L-BFGS takes one V-cycle as its fixed H₀. The error that it leaves is reduced by the pairs; a Krylov
+method inside would cost more V-cycles (ball on a block, 15,000 unknowns: 65 V-cycles, against 95 by
+conjugate gradients to 1e-1 and 190 to 1e-2). Newton's method needs the Krylov method, with a
 tolerance that follows the residual (Eisenstat and Walker).
 """
 
@@ -31,16 +30,16 @@ from fenics_contact.systems.modes import rigid_motions
 __all__ = [
     "KINDS",
     "cube_size",
+    "describe_memory_excess",
     "factor_bytes",
+    "find_available_memory",
     "forget_failure",
-    "memory",
+    "is_multigrid_faster",
     "near_nullspace",
     "newton_options",
     "options",
     "quasi_newton_options",
-    "quicker",
     "refused_memory",
-    "too_large",
     "warn_of_slow_blas",
 ]
 
@@ -48,99 +47,102 @@ logger = logging.getLogger("fenics_contact")
 
 KINDS = ("direct", "multigrid")
 
-# Bytes of MUMPS' Cholesky factor, measured from 12,000 to 463,000 unknowns on cubes and squares,
-# P1 and P2: 230 n^(4/3) in three dimensions and 75 n log₂ n in two; an LU factor has 1.8 of it.
-_FACTOR = {2: 75.0, 3: 230.0}
-_LU = 1.8
-# A factor, with all else that is kept, may take this share of the memory.
-_SHARE = 0.5
-# From this many unknowns of a cube on multigrid is quicker, in three dimensions; in two MUMPS
-# always is.
-_MANY = 30_000
-# One factorisation for a whole load history pays longer: condensed onto Γc, it takes as long as two
-# increments by multigrid at 108,000 unknowns, and as long as four at 200,000.
-_MANY_PER_INCREMENT = 50_000
+# Bytes of MUMPS' Cholesky factor over n^(4/3) in three dimensions and n log₂ n in two, measured
+# from 12,000 to 463,000 unknowns on cubes and squares, P1 and P2; ratio of an LU factor to it.
+_FACTOR_BYTES = {2: 75.0, 3: 230.0}
+_LU_RATIO = 1.8
+# Largest estimated factor relative to the memory.
+_MAX_MEMORY_RATIO = 0.5
+# `cube_size` from which multigrid is faster in three dimensions; in two MUMPS always is.
+_MULTIGRID_SIZE = 30_000
+# The same per increment if one factorisation condenses for all: it costs two increments by
+# multigrid at 108,000 unknowns, and four at 200,000.
+_SIZE_PER_INCREMENT = 50_000
 
-# MUMPS' errors INFOG(1) for workspace that is too small, or memory that was not to be had.
-_NO_MEMORY = (-5, -7, -8, -9, -11, -13, -14, -15, -17, -18, -19, -20)
+# MUMPS' errors INFOG(1) for insufficient workspace or memory.
+_MEMORY_ERRORS = (-5, -7, -8, -9, -11, -13, -14, -15, -17, -18, -19, -20)
 
-_MULTIGRID: dict[str, Any] = {
+_GAMG_OPTIONS: dict[str, Any] = {
     "pc_type": "gamg",
-    # Dirichlet rows and what they cut off are no neighbours to be aggregated with.
+    # Do not aggregate across Dirichlet rows.
     "pc_gamg_threshold": 0.0,
     "mg_levels_pc_type": "sor",
-    # For those who name `-pc_type hypre`: quicker to set up, slower on slender bodies.
+    # For `-pc_type hypre`: faster to set up, slower on slender bodies.
     "pc_hypre_boomeramg_strong_threshold": 0.7,
 }
-# A set-up costs as much as ten V-cycles, and contact changes few rows: one serves four iterations.
-_NEWTON: dict[str, Any] = {
+# A set-up costs ten V-cycles, and contact changes few rows: one serves four iterations.
+_NEWTON_OPTIONS: dict[str, Any] = {
     "snes_ksp_ew": True,
     "snes_ksp_ew_rtol0": 1e-2,
     "snes_ksp_ew_rtolmax": 1e-2,
     "snes_lag_preconditioner": 4,
 }
-# SNES leaves it to `Hierarchy`, after the first time.
-_QUASI_NEWTON: dict[str, Any] = {"snes_lag_preconditioner": -2}
+# After the first set-up `Hierarchy` updates the preconditioner.
+_LBFGS_OPTIONS: dict[str, Any] = {"snes_lag_preconditioner": -2}
 
 
 def options(kind: str, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
-    """Options of a linear solver.
+    """Return the options of a linear solver.
 
     Args:
         kind: One of `KINDS`.
-        symmetric: Whether the matrix is.
-        accurate: Whether it is to solve systems, or to be the fixed map H₀ of L-BFGS.
+        symmetric: Whether the matrix is symmetric.
+        accurate: Whether to solve systems accurately; otherwise it is the fixed map H₀ of L-BFGS.
     """
     if kind == "direct":
         return {
             "ksp_type": "preonly",
             "pc_type": "cholesky" if symmetric else "lu",
             "pc_factor_mat_solver_type": "mumps",
-            # On several ranks MUMPS distributes work as it goes, and may want more than it thought.
+            # MUMPS underestimates its workspace on several ranks.
             "mat_mumps_icntl_14": 100,
         }
     if not accurate:
-        return {"ksp_type": "preonly"} | _MULTIGRID
-    found = {"ksp_rtol": 1e-6, "ksp_max_it": 500, "ksp_norm_type": "unpreconditioned"} | _MULTIGRID
+        return {"ksp_type": "preonly"} | _GAMG_OPTIONS
+    base = {
+        "ksp_rtol": 1e-6,
+        "ksp_max_it": 500,
+        "ksp_norm_type": "unpreconditioned",
+    } | _GAMG_OPTIONS
     if symmetric:
-        return found | {"ksp_type": "cg"}
-    return found | {"ksp_type": "gmres", "ksp_pc_side": "right", "ksp_gmres_restart": 60}
+        return base | {"ksp_type": "cg"}
+    return base | {"ksp_type": "gmres", "ksp_pc_side": "right", "ksp_gmres_restart": 60}
 
 
 def quasi_newton_options(kind: str) -> dict[str, Any]:
-    """Options of L-BFGS: when SNES sets up H₀."""
-    return dict(_QUASI_NEWTON) if kind == "multigrid" else {}
+    """Return the options of L-BFGS that control the set-up of H₀."""
+    return dict(_LBFGS_OPTIONS) if kind == "multigrid" else {}
 
 
 def newton_options(kind: str) -> dict[str, Any]:
-    """Options of Newton's method: how well its linear systems are solved."""
-    return dict(_NEWTON) if kind == "multigrid" else {}
+    """Return the options of Newton's method that control its linear solver."""
+    return dict(_NEWTON_OPTIONS) if kind == "multigrid" else {}
 
 
 def factor_bytes(n: int, dimension: int, *, symmetric: bool) -> float:
-    """Memory that MUMPS needs for a factor of a stiffness over n unknowns, estimated (bytes)."""
+    """Estimate the memory of a MUMPS factor of a stiffness over n unknowns (bytes)."""
     growth = n ** (4 / 3) if dimension == 3 else n * np.log2(max(n, 2))
-    return float(_FACTOR[dimension] * growth * (1.0 if symmetric else _LU))
+    return float(_FACTOR_BYTES[dimension] * growth * (1.0 if symmetric else _LU_RATIO))
 
 
-def memory(comm: MPI.Comm) -> float:
-    """Memory of the machines that the ranks run on, or what they may use of it. Collective."""
+def find_available_memory(comm: MPI.Comm) -> float:
+    """Return the memory available to all ranks (bytes). Collective."""
     size = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    for name in ("memory.max", "memory/memory.limit_in_bytes"):  # of a container, cgroups v2, v1
+    for name in ("memory.max", "memory/memory.limit_in_bytes"):  # cgroups v2, v1
         try:
             size = min(size, float((Path("/sys/fs/cgroup") / name).read_text()))
         except (OSError, ValueError):
-            continue  # there is none, or it is "max"
+            continue  # no such file, or "max"
     node = comm.Split_type(MPI.COMM_TYPE_SHARED)
-    share = size / node.size
+    available = size / node.size
     node.Free()
-    return float(comm.allreduce(share))
+    return float(comm.allreduce(available))
 
 
-def too_large(n_bytes: float, comm: MPI.Comm) -> str | None:
-    """Why factors of this size are not to be made; None if they may. Collective."""
-    available = memory(comm)
-    if n_bytes <= _SHARE * available:
+def describe_memory_excess(n_bytes: float, comm: MPI.Comm) -> str | None:
+    """Return why factors of this size exceed the memory; None if they fit. Collective."""
+    available = find_available_memory(comm)
+    if n_bytes <= _MAX_MEMORY_RATIO * available:
         return None
     return (
         f"its factorisation would take about {n_bytes / 2**30:.1f} of {available / 2**30:.1f} GiB "
@@ -149,20 +151,20 @@ def too_large(n_bytes: float, comm: MPI.Comm) -> str | None:
 
 
 def refused_memory(pc: PETSc.PC) -> bool:
-    """Whether a factorisation failed because it did not get its memory."""
+    """Return whether a factorisation ran out of memory."""
     if not pc.getFailedReason():
         return False
     if pc.getFailedReason() == PETSc.PC.FailedReason.FACTOR_OUTMEMORY:
         return True
     mumps = pc.getType() in ("lu", "cholesky") and pc.getFactorSolverType() == "mumps"
-    # PETSc has no reason of its own for some of MUMPS' errors.
-    return mumps and pc.getFactorMatrix().getMumpsInfog(1) in _NO_MEMORY
+    # PETSc does not map all of MUMPS' errors.
+    return mumps and pc.getFactorMatrix().getMumpsInfog(1) in _MEMORY_ERRORS
 
 
 def forget_failure(pc: PETSc.PC) -> None:
-    """Let the next matrix be factored anew where a factorisation has failed. Collective.
+    """Reset a preconditioner whose factorisation failed. Collective.
 
-    PETSc would take MUMPS' failure for that of all matrices to come, and solve with no factors.
+    PETSc would otherwise apply MUMPS' failure to all later matrices and solve without factors.
     """
     if pc.getFailedReason() and pc.getType() in ("lu", "cholesky"):
         operators = pc.getOperators()
@@ -172,11 +174,11 @@ def forget_failure(pc: PETSc.PC) -> None:
 
 @functools.cache
 def warn_of_slow_blas() -> None:
-    """Log once if the process runs on the reference BLAS, as Debian's packages do by default."""
+    """Log once if the process uses the reference BLAS, the default of Debian's packages."""
     try:
         libraries = Path("/proc/self/maps").read_text()
     except OSError:
-        return  # no Linux: nothing to tell from
+        return  # not Linux
     if "/blas/libblas.so" in libraries:
         logger.warning(
             "the reference BLAS is in use: factorisations take up to eight times as long as with "
@@ -184,55 +186,54 @@ def warn_of_slow_blas() -> None:
         )
 
 
-def quicker(n: float, dimension: int, *, condensed_for: int = 0) -> bool:
-    """Whether multigrid is quicker than factorisations, by measured cost.
+def is_multigrid_faster(n: float, dimension: int, *, condensed_for: int = 0) -> bool:
+    """Return whether multigrid is faster than factorisations, by measured cost.
 
-    Plates under a bolt (`scenes/bolted_joint.py`, three bodies, quadratic), one Cholesky
-    factorisation by MUMPS over a solution by conjugate gradients with GAMG: 0.30 at 33,000
+    Time of one Cholesky factorisation by MUMPS relative to a solution by conjugate gradients with
+    GAMG for bolted plates (`scenes/bolted_joint.py`, three bodies, quadratic): 0.30 at 33,000
     unknowns, 0.41 at 55,000, 0.60 at 107,000 and 1.02 at 190,000, whose `cube_size` is 29,000.
 
     Args:
         n: Number of unknowns in the plane, their `cube_size` in space.
-        dimension: Of the mesh.
-        condensed_for: The increments that one factorisation serves; 0: it serves none alone.
+        dimension: Dimension of the mesh.
+        condensed_for: Number of increments that one factorisation serves; 0: none alone.
     """
-    return dimension == 3 and n > max(_MANY, condensed_for * _MANY_PER_INCREMENT)
+    return dimension == 3 and n > max(_MULTIGRID_SIZE, condensed_for * _SIZE_PER_INCREMENT)
 
 
 def cube_size(space: fem.FunctionSpace, body: npt.NDArray[np.intp]) -> float:
-    """Unknowns of a cube that takes as many operations for each of them to factor. Collective.
+    """Return the unknowns of a cube with as many operations per unknown to factor. Collective.
 
-    A factorisation takes n w² operations if w unknowns lie in a cross-section of a body, and
-    multigrid some n. In a cube w is n^(2/3). A body longer than it is wide and high, by s to the
-    mean of both, has as many in its cross-sections as a cube of n / s; and of several bodies, which
-    contact ties together at their sides alone, the mean of w² counts. Turning it changes nothing.
+    A factorisation takes n w² operations if a cross-section of a body has w unknowns, n^(2/3) in a
+    cube. A body longer than its mean width by s has the cross-sections of a cube of n / s unknowns;
+    for several bodies w² is averaged. The size is invariant under rotations.
 
     Args:
-        space: Of the displacement, in space; of its nodes s is told: 1 of a cube, a/√(b c) of a box
-            a, b, c with even cells.
-        body: That of each node, ghosts included.
+        space: Function space of the displacement; its nodes give s: 1 for a cube, a/√(b c) for a
+            box a, b, c with even cells.
+        body: Body of each node, ghosts included.
     """
     comm, dofmap = space.mesh.comm, space.dofmap
     n_owned, n = dofmap.index_map.size_local, dofmap.index_map.size_global
     x, body = space.tabulate_dof_coordinates()[:n_owned], body[:n_owned]
-    # About a place within the mesh, however far that is from the origin.
+    # Relative to the mean, against cancellation far from the origin.
     x = x - global_sum(comm, x.sum(axis=0)) / n
     n_bodies = 1 + int(global_max(comm, body.astype(np.float64)))
-    moments = np.zeros((n_bodies, 4, 4))  # of 1 and x, their products summed up
+    moments = np.zeros((n_bodies, 4, 4))  # sums of the products of (1, x)
     np.add.at(moments, body, np.einsum("pi,pj->pij", *[np.insert(x, 0, 1.0, axis=1)] * 2))
     work = 0.0
     for moment in broadcast_from_root(comm, global_sum(comm, moments)):
-        count, first = moment[0, 0], moment[0, 1:]
-        spread = np.linalg.eigvalsh(moment[1:, 1:] - np.outer(first, first) / count)
-        slender = np.sqrt(spread[2] / np.sqrt(spread[0] * spread[1]))
-        work += count * (count / slender) ** (4 / 3)
+        count, sum_x = moment[0, 0], moment[0, 1:]
+        inertia = np.linalg.eigvalsh(moment[1:, 1:] - np.outer(sum_x, sum_x) / count)
+        slenderness = np.sqrt(inertia[2] / np.sqrt(inertia[0] * inertia[1]))
+        work += count * (count / slenderness) ** (4 / 3)
     return float(dofmap.bs * (work / n) ** (3 / 4))
 
 
 def near_nullspace(space: fem.FunctionSpace) -> PETSc.NullSpace:
-    """The rigid motions at the nodes, orthonormal: what the coarse levels must have. Collective.
+    """Return the orthonormal rigid-body modes at the nodes, for GAMG. Collective.
 
-    Those of all bodies together: within an aggregate of few nodes they are the motions of each.
+    Those of all bodies together suffice: within an aggregate they span the modes of each body.
     """
     mesh, dofmap = space.mesh, space.dofmap
     comm, gdim = mesh.comm, mesh.geometry.dim

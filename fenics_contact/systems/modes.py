@@ -1,4 +1,4 @@
-"""Rigid motions as displacements."""
+"""Displacements of rigid-body modes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["rigid_motions"]
 
 
 def rigid_motions(arm: Array, size: float) -> dict[str, Array]:
-    """Rigid motions of points at ``arm`` from the centre, (n, gdim), by name."""
+    """Return the rigid-body modes of points at ``arm`` from the centre, (n, gdim), by name."""
     n, d = arm.shape
     motions = {}
     for i, axis in enumerate("xyz"[:d]):
@@ -18,7 +18,7 @@ def rigid_motions(arm: Array, size: float) -> dict[str, Array]:
     for i, axis in enumerate("xyz"):
         j, k = (i + 1) % 3, (i + 2) % 3
         if max(j, k) < d:
-            turn = np.zeros((n, d))
-            turn[:, j], turn[:, k] = -arm[:, k] / size, arm[:, j] / size
-            motions[f"rotation about {axis}"] = turn
+            rotation = np.zeros((n, d))
+            rotation[:, j], rotation[:, k] = -arm[:, k] / size, arm[:, j] / size
+            motions[f"rotation about {axis}"] = rotation
     return motions

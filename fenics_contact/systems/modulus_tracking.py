@@ -1,4 +1,4 @@
-"""Young's modulus of a bulk form, for contacts whose stiffness is a multiple of E/h."""
+"""Young's modulus of a bulk form, for contact stiffnesses given as multiples of E/h."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ __all__ = ["TrackedModulus"]
 
 
 class TrackedModulus:
-    """E as it was measured last; contacts to which it was given by their caller are left alone.
+    """Young's modulus E of the bulk form for the contacts that need it.
 
-    The constructor is collective.
+    The constructor is collective. A modulus given by the user is not changed.
 
     Args:
         bulk: The bulk form.
-        displacement: In it.
-        contacts: Of the problem.
+        displacement: The displacement in the form.
+        contacts: Contacts of the problem.
 
     Attributes:
-        present: One value per cell (stress); None: no contact asks for it.
+        present: One value per cell (stress); None: no contact needs it.
     """
 
     def __init__(self, bulk: Bulk, displacement: Displacement, contacts: Sequence[Contact]) -> None:
@@ -35,13 +35,13 @@ class TrackedModulus:
         self.measure()
 
     def measure(self) -> None:
-        """Let stiffnesses follow E of the bulk form as it is now. Collective."""
+        """Evaluate E from the bulk form and update the contacts. Collective."""
         if self._contacts:
             weight = self._contacts[0].inputs.weight
             self.put_back(cell_modulus(self._bulk.tangent_form, self._displacement, weight))
 
     def put_back(self, modulus: fem.Function | None) -> None:
-        """Let them be multiples of what ``present`` was before. Collective."""
+        """Set E to an earlier value of ``present`` and update the contacts. Collective."""
         self.present = modulus
         if modulus is not None:
             for contact in self._contacts:

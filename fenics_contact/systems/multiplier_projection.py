@@ -1,17 +1,14 @@
-"""Changes of tangential multipliers that displacements answer.
+"""Projection of the updates of tangential multipliers onto the free displacements.
 
-Multipliers are functions on Γc, and where a condition holds displacements, as on a plane of
-symmetry, there are more of them than free displacements: some changes of them are forces that add
-up to nothing at every free displacement. Nothing answers those, so that nothing ends them: they
-grow from round to round until friction at the edge of Γc reaches its limit by them alone. They are
-left out: what is kept of a change is the closest that a displacement of free unknowns makes at the
-points. What is left of it at the edge stays with the springs, and falls with the mesh.
+Next to Dirichlet nodes, as on a plane of symmetry, the multiplier space is too rich: part of an
+Uzawa update lies in the kernel of the coupling matrix restricted to the free dofs, is never
+corrected, and grows until the friction bound at the edge of Γc is reached. The update is therefore
+replaced by the closest jump of free displacements. The error at the edge is carried by the penalty
+and decreases with the mesh size. Quadratic displacements with linear multipliers are rich enough.
 
-Of quadratic displacements, whose multipliers are linear, there are more than enough.
-
-It is the conditions that hold a displacement at rest that this is for. One that moves relative to
-the obstacle prescribes a slip, and friction has to reach its limit there; and one that holds a node
-inside of the obstacle is refused, by the normal multipliers that nothing ends.
+Only dofs fixed relative to the obstacle are excluded. A Dirichlet condition that moves relative to
+it prescribes a slip, at which friction has to reach its bound. Normal multipliers are not
+projected: those at a node fixed inside the obstacle have to diverge.
 """
 
 from __future__ import annotations
@@ -28,14 +25,14 @@ __all__ = ["project_multiplier_updates"]
 
 
 def project_multiplier_updates(operator: ContactOperator, state: Array, constrained: Mask) -> None:
-    """Let the next change of multipliers be without what displacements do not answer. Collective.
+    """Project the next update of the tangential multipliers. Collective.
 
-    The change is what `Contact.enforcement_error` measures, and what `Contact.augment` makes.
+    It is the update that `Contact.enforcement_error` measures and `Contact.augment` makes.
 
     Args:
-        operator: Of an evaluated contact with multipliers, over all unknowns.
+        operator: Operator of an evaluated contact with multipliers, over all unknowns.
         state: These unknowns, (n_local,).
-        constrained: Mask over them: those with Dirichlet conditions.
+        constrained: Mask of the unknowns with Dirichlet conditions, (n_local,).
     """
     contact = operator.contact
     multipliers = contact.multipliers
@@ -43,32 +40,32 @@ def project_multiplier_updates(operator: ContactOperator, state: Array, constrai
         return
     if contact.contact_kinematics.turns:
         return
-    held = _at_rest(operator, state, constrained)
-    if not global_max(operator.unknowns.comm, held.astype(np.float64)):
+    fixed = _find_fixed_dofs(operator, state, constrained)
+    if not global_max(operator.unknowns.comm, fixed.astype(np.float64)):
         return
     values, force = contact.values, operator.unknowns.vector()
     change = multipliers.tangential_change(values)
-    across = np.eye(change.shape[1]) - np.einsum("qi,qj->qij", values.normal, values.normal)
-    stiffness = operator.springs(across)
+    tangential = np.eye(change.shape[1]) - np.einsum("qi,qj->qij", values.normal, values.normal)
+    stiffness = operator.springs(tangential)
     operator.add_force(force, -values.tangential(change))
-    free, closest = force.duplicate(), force.duplicate()
-    free.array[:] = ~held
+    free, projection = force.duplicate(), force.duplicate()
+    free.array[:] = ~fixed
     force.pointwiseMult(free, force)
-    # The rows of what is held are empty then, and nothing acts there.
+    # Rows of fixed dofs become empty, without forces.
     stiffness.diagonalScale(free, free)
     solver = mass_solver(stiffness, rtol=ROUND_OFF, atol=1e-300, max_it=500)
-    solver.solve(force, closest)
-    multipliers.leave_out(change - values.tangential(operator.jump(closest.array_r)))
-    for item in (force, stiffness, free, closest, solver):
+    solver.solve(force, projection)
+    multipliers.leave_out(change - values.tangential(operator.jump(projection.array_r)))
+    for item in (force, stiffness, free, projection, solver):
         item.destroy()
 
 
-def _at_rest(operator: ContactOperator, state: Array, constrained: Mask) -> Mask:
-    """Unknowns that the points feel and a condition keeps where the obstacle is. Collective."""
-    touched = np.zeros(len(constrained), dtype=np.bool_)
-    touched[operator.touched] = True
-    moved = operator.unknowns.vector()
-    operator.add_force(moved, np.abs(operator.contact.values.shift))
-    held = touched & constrained & (state == 0.0) & (moved.array_r == 0.0)
-    moved.destroy()
-    return held
+def _find_fixed_dofs(operator: ContactOperator, state: Array, constrained: Mask) -> Mask:
+    """Return the coupled unknowns that are fixed at the obstacle, a mask. Collective."""
+    coupled = np.zeros(len(constrained), dtype=np.bool_)
+    coupled[operator.touched] = True
+    shift = operator.unknowns.vector()
+    operator.add_force(shift, np.abs(operator.contact.values.shift))
+    fixed = coupled & constrained & (state == 0.0) & (shift.array_r == 0.0)
+    shift.destroy()
+    return fixed

@@ -1,8 +1,7 @@
-"""Reference scales: what forces, displacements, energies and stiffness are compared with.
+"""Reference scales of forces, displacements, energies and stiffness, by body.
 
-A quantity is zero, small or large relative to another one of the same body or of the same contact.
-The largest one of a problem is no reference: what an unrelated body in the same mesh is, does or
-bears must not change what is found of this one.
+A quantity is compared with others of the same body or contact, never with the largest of the
+problem: unrelated bodies in the same mesh must not change the result for this one.
 """
 
 from __future__ import annotations
@@ -30,33 +29,31 @@ __all__ = ["ReferenceScales", "body_of_points"]
 
 
 class ReferenceScales:
-    """Reference quantities of every body and of every free obstacle, the same on every rank.
+    """Reference quantities of every body and free obstacle, the same on every rank.
 
-    Bodies come first, then the obstacles that move freely (together: the parts). Two of them are
-    coupled in an increment if a point of a contact belongs to both. The constructor is collective.
+    The parts are the bodies, then the free obstacles. Two of them are coupled in an increment if
+    they share a contact point. The constructor is collective.
 
     Args:
-        displacement: In what is solved for.
+        displacement: The displacement within the solution function.
         body: Body of every node of this rank, ghosts last.
-        moves: Which of these unknowns are displacements or motions, (n_local,).
+        is_displacement: Mask of the unknowns that are displacements or motions, (n_local,).
         n_motions: Number of free motions of obstacles, each of which is a part.
-        contacts: Of the problem.
+        contacts: Contacts of the problem.
 
     Attributes:
         n_bodies: Number of bodies.
         label: Part of every unknown of this rank, (n_local,).
         centre: Middle of the bounding box of every body, (n_bodies, gdim) (length).
         size: Diagonal of that box, (n_bodies,) (length).
-        cell_size: Mean size of its cells, (n_bodies,) (length).
+        cell_size: Mean cell size, (n_bodies,) (length).
         mesh_size: Diagonal of the bounding box of all bodies (length).
-        stiffness: Largest entry of a body on the diagonal of the bulk's tangent, (n_bodies,)
-            (force/length).
-        least_force: Smallest such entry, but those that are none, times size, (n_bodies,) (force).
-        group: Number of the group of coupled parts that a part belongs to, (n_parts,).
-        touching: Which bodies a contact touches, with the pairs at the start of the increment,
-            (n_contacts, n_bodies).
-        held: Which parts Dirichlet conditions, or springs of the bulk, hold against every rigid
-            motion, (n_parts,).
+        stiffness: Largest diagonal entry of the bulk tangent, (n_bodies,) (force/length).
+        min_force: Smallest positive diagonal entry times size, (n_bodies,) (force).
+        group: Group of coupled parts of every part, (n_parts,).
+        contact_bodies: Mask of the bodies that a contact couples, with the pairs at the start of
+            the increment, (n_contacts, n_bodies).
+        constrained: Mask of the parts without free rigid-body modes, (n_parts,).
     """
 
     def __init__(
@@ -64,38 +61,38 @@ class ReferenceScales:
         displacement: Displacement,
         body: npt.NDArray[np.intp],
         label: npt.NDArray[np.intp],
-        moves: Mask,
+        is_displacement: Mask,
         n_motions: int,
         contacts: Sequence[Contact],
     ) -> None:
         space = displacement.u.function_space
-        self._comm, self.label, self._moves = space.mesh.comm, label, moves
+        self._comm, self.label, self._is_displacement = space.mesh.comm, label, is_displacement
         n_bodies = self._comm.allreduce(int(body.max(initial=-1)), op=MPI.MAX) + 1
         n_owned, d = space.dofmap.index_map.size_local, space.mesh.geometry.dim
-        x, mine = space.tabulate_dof_coordinates()[:n_owned, :d], body[:n_owned]
+        x, own = space.tabulate_dof_coordinates()[:n_owned, :d], body[:n_owned]
         corners = np.full((2, n_bodies, d), np.inf)
         for corner, sign in zip(corners, (1.0, -1.0), strict=True):
-            np.minimum.at(corner, mine, sign * x)
+            np.minimum.at(corner, own, sign * x)
         self._comm.Allreduce(MPI.IN_PLACE, corners, op=MPI.MIN)
         low, high = corners[0], -corners[1]
         self.n_bodies, self.centre = n_bodies, (low + high) / 2
         self.size: Array = np.linalg.norm(high - low, axis=1)
         self.mesh_size = float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
-        n_nodes = global_sum(self._comm, np.bincount(mine, minlength=n_bodies))
+        n_nodes = global_sum(self._comm, np.bincount(own, minlength=n_bodies))
         self.cell_size = np.asarray(self.size / n_nodes ** (1 / d), dtype=np.float64)
         self.stiffness: Array = np.ones(n_bodies)
-        self.least_force: Array = np.zeros(n_bodies)
+        self.min_force: Array = np.zeros(n_bodies)
         self.group: Index = np.arange(n_bodies + n_motions)
-        self.touching: Mask = np.zeros((len(contacts), n_bodies), dtype=np.bool_)
+        self.contact_bodies: Mask = np.zeros((len(contacts), n_bodies), dtype=np.bool_)
         counts = np.cumsum([0] + [len(contact.motions) for contact in contacts])
         self._motions = [
             n_bodies + np.arange(first, last) for first, last in itertools.pairwise(counts)
         ]
         turns = [motion.turns for contact in contacts for motion in contact.motions]
-        self._turning = n_bodies + np.flatnonzero(turns)
-        self.held: Mask = np.ones(n_bodies + n_motions, dtype=np.bool_)
-        self._own = [body_of_points(contact, space, body) for contact in contacts]
-        self._coupled: list[int] | None = None  # numbers of the pairs whose coupling was found
+        self._rotations = n_bodies + np.flatnonzero(turns)
+        self.constrained: Mask = np.ones(n_bodies + n_motions, dtype=np.bool_)
+        self._slave_bodies = [body_of_points(contact, space, body) for contact in contacts]
+        self._pairings: list[int] | None = None  # pairs for which groups were found
 
     @property
     def force(self) -> Array:
@@ -103,49 +100,36 @@ class ReferenceScales:
         return self.stiffness * self.size
 
     def measure_stiffness(self, stiffness: PETSc.Mat) -> None:
-        """Take the stiffness of the bodies from the bulk's tangent. Collective.
-
-        Args:
-            stiffness: Over all unknowns, without conditions.
-        """
+        """Evaluate the stiffness of the bodies from the bulk tangent. Collective."""
         diagonal = stiffness.getDiagonal()
         entries = diagonal.array_r.copy()
         diagonal.destroy()
         largest = self.largest(entries)
         inverse = self.largest(1.0 / np.where(entries > 0.0, entries, np.inf))
         self.stiffness = np.where(largest > 0, largest, 1.0)
-        self.least_force = self.size / np.where(inverse > 0, inverse, np.inf)
+        self.min_force = self.size / np.where(inverse > 0, inverse, np.inf)
 
     def largest(self, values: Array) -> Array:
-        """Largest absolute value of every body, at its displacements, (n_bodies,). Collective.
+        """Return the largest absolute displacement of every body, (n_bodies,). Collective.
 
-        Args:
-            values: At this rank's unknowns; those at others, such as pressures, do not count.
+        Values of other fields, such as pressures, are ignored.
         """
-        found: Array = np.zeros(len(self.group))
-        np.maximum.at(found, self.label[self._moves], np.abs(values[self._moves]))
-        self._comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
-        return found[: self.n_bodies]
+        result: Array = np.zeros(len(self.group))
+        np.maximum.at(
+            result, self.label[self._is_displacement], np.abs(values[self._is_displacement])
+        )
+        self._comm.Allreduce(MPI.IN_PLACE, result, op=MPI.MAX)
+        return result[: self.n_bodies]
 
     def largest_at_points(self, number: int, values: Array) -> Array:
-        """Largest value of every body at the points of a contact, (n_bodies,). Collective.
-
-        Args:
-            number: Of the contact.
-            values: At this rank's points, (n_points,), not negative.
-        """
-        found: Array = np.zeros(self.n_bodies)
-        np.maximum.at(found, self._own[number], values)
-        self._comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
-        return found
+        """Return the largest of values ≥ 0, (n_points,), by slave body, (n_bodies,). Collective."""
+        result: Array = np.zeros(self.n_bodies)
+        np.maximum.at(result, self._slave_bodies[number], values)
+        self._comm.Allreduce(MPI.IN_PLACE, result, op=MPI.MAX)
+        return result
 
     def spread(self, values: Array, chosen: Mask) -> Array:
-        """Largest less smallest of some values of every body, (n_bodies,). Collective.
-
-        Args:
-            values: At this rank's unknowns.
-            chosen: Which of them count.
-        """
+        """Return maximum minus minimum of chosen values of every body, (n_bodies,). Collective."""
         ends = np.full((2, len(self.group)), -np.inf)
         for end, sign in zip(ends, (1.0, -1.0), strict=True):
             np.maximum.at(end, self.label[chosen], sign * values[chosen])
@@ -153,38 +137,29 @@ class ReferenceScales:
         return np.maximum(ends.sum(axis=0), 0.0)[: self.n_bodies]
 
     def begin(self, operators: Sequence[ContactOperator]) -> None:
-        """Find which parts are coupled. Collective.
-
-        Args:
-            operators: Of the contacts, over all unknowns, at the start of an increment.
-        """
-        if self._coupled == (coupled := [o.contact.pairs.number for o in operators]):
+        """Find the groups of coupled parts at the start of an increment. Collective."""
+        if self._pairings == (pairings := [o.contact.pairs.number for o in operators]):
             return
-        self._coupled, n = coupled, len(self.group)
-        self.touching = np.zeros((len(operators), self.n_bodies), dtype=np.bool_)
-        every: list[Any] = [np.zeros((0, 2), dtype=np.intp)]
+        self._pairings, n = pairings, len(self.group)
+        self.contact_bodies = np.zeros((len(operators), self.n_bodies), dtype=np.bool_)
+        all_pairs: list[Any] = [np.zeros((0, 2), dtype=np.intp)]
         for number, operator in enumerate(operators):
             pairs = self.pairs(operator, number, self.label)
-            self.touching[number, pairs[pairs < self.n_bodies]] = True
-            every.append(pairs)
-        links = np.concatenate(every)
+            self.contact_bodies[number, pairs[pairs < self.n_bodies]] = True
+            all_pairs.append(pairs)
+        links = np.concatenate(all_pairs)
         graph = scipy.sparse.coo_matrix((np.ones(len(links)), links.T), (n, n))
         _, self.group = scipy.sparse.csgraph.connected_components(graph, directed=False)
 
     @property
     def round_off_of_groups(self) -> Array:
-        """Force on a group of coupled parts that is round-off, of its softest body, (n_groups,)."""
-        found = np.full(self.n_groups, np.inf)
-        np.minimum.at(found, self.group[: self.n_bodies], ROUND_OFF * self.force)
-        return np.where(np.isfinite(found), found, 0.0)
+        """Round-off of forces on each group, by its softest body, (n_groups,) (force)."""
+        result = np.full(self.n_groups, np.inf)
+        np.minimum.at(result, self.group[: self.n_bodies], ROUND_OFF * self.force)
+        return np.where(np.isfinite(result), result, 0.0)
 
     def round_off_at_points(self, number: int, forces: Array) -> Array:
-        """Force at points of a contact that is round-off, by their group, (n_points,). Collective.
-
-        Args:
-            number: Of the contact.
-            forces: Sizes of forces there, (n_points,) (force).
-        """
+        """Return the round-off of forces at contact points, (n_points,) (force). Collective."""
         group, largest = self.group_of_points(number), np.zeros(self.n_groups)
         np.maximum.at(largest, group, np.where(np.isfinite(forces), forces, 0.0))
         self._comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
@@ -192,13 +167,13 @@ class ReferenceScales:
 
     @property
     def size_of_groups(self) -> Array:
-        """Size of the largest body of a group of coupled parts, (n_groups,) (length)."""
-        found: Array = np.zeros(self.n_groups)
-        np.maximum.at(found, self.group[: self.n_bodies], self.size)
-        return found
+        """Size of the largest body of each group, (n_groups,) (length)."""
+        result: Array = np.zeros(self.n_groups)
+        np.maximum.at(result, self.group[: self.n_bodies], self.size)
+        return result
 
     def size_at_points(self, number: int) -> Array:
-        """`size_of_groups` at this rank's points of a contact, by its number, (n_points,)."""
+        """Return `size_of_groups` at this rank's points of a contact, (n_points,)."""
         return np.asarray(self.size_of_groups[self.group_of_points(number)])
 
     @property
@@ -207,50 +182,46 @@ class ReferenceScales:
         return int(self.group.max()) + 1
 
     def global_sum(self, values: Array) -> Array:
-        """Sum over all ranks. Collective."""
+        """Return the sum over all ranks. Collective."""
         return global_sum(self._comm, values)
 
     def group_of_points(self, number: int) -> Index:
-        """Groups of the bodies with this rank's points of a contact, by its number, (n_points,)."""
-        return np.asarray(self.group[self._own[number]])
+        """Return the group of each of this rank's points of a contact, (n_points,)."""
+        return np.asarray(self.group[self._slave_bodies[number]])
 
     def parts_of(self, number: int) -> dict[int, Mask]:
-        """Masks of this rank's points of a contact, (n_points,), by the group they are on.
+        """Return masks of this rank's points of a contact, (n_points,), by group. Collective.
 
-        Collective; all ranks have the same groups, in the same order.
+        All ranks have the same groups in the same order.
         """
         group = self.group_of_points(number)
-        every = {n for each in self._comm.allgather(np.unique(group).tolist()) for n in each}
-        return {n: group == n for n in sorted(every)}
+        groups = {n for each in self._comm.allgather(np.unique(group).tolist()) for n in each}
+        return {n: group == n for n in sorted(groups)}
 
     def modulus(self, number: int) -> float:
-        """Stiffness of the bodies that a contact touches, by the size of their cells (stress)."""
-        d, mine = self.centre.shape[1], self.touching[number]
+        """Return the largest stiffness over cell size of the bodies in a contact (stress)."""
+        d, bodies = self.centre.shape[1], self.contact_bodies[number]
         moduli = self.stiffness * self.cell_size ** (2 - d)
-        return float(moduli[mine].max(initial=0.0))
+        return float(moduli[bodies].max(initial=0.0))
 
     def pairs(self, operator: ContactOperator, number: int, label: Index) -> Index:
-        """Parts that a contact presses on each other, (n_pairs, 2). Collective.
+        """Return the pairs of parts in a contact, (n_pairs, 2). Collective.
 
-        A body that it presses on a rigid obstacle, or on nothing, is paired with itself.
-
-        Args:
-            operator: Of the contact, over some unknowns.
-            number: Of the contact.
-            label: Part of each of these unknowns.
+        A body on a rigid obstacle, or without an opposite point, is paired with itself. The
+        operator is over unknowns of the parts in ``label``.
         """
-        own, n = self._own[number], len(self.group)
-        # Of the number of the part as a displacement a jump is the difference of both sides.
-        jump = operator.jump(np.where(np.isin(label, self._turning), 0.0, label + 1.0))
-        opposite = np.rint(own[:, None] + 1 - jump).astype(np.intp) - 1
-        opposite = np.where(opposite < 0, own[:, None], opposite)
-        others = [*opposite.T, *(np.full_like(own, m) for m in self._motions[number])]
-        mine = np.unique(np.concatenate([n * own + other for other in others]))
-        return np.column_stack(divmod(np.unique(np.concatenate(self._comm.allgather(mine))), n))
+        slave, n = self._slave_bodies[number], len(self.group)
+        # With part numbers as displacements, the jump is the difference of both sides.
+        jump = operator.jump(np.where(np.isin(label, self._rotations), 0.0, label + 1.0))
+        master = np.rint(slave[:, None] + 1 - jump).astype(np.intp) - 1
+        master = np.where(master < 0, slave[:, None], master)
+        masters = [*master.T, *(np.full_like(slave, m) for m in self._motions[number])]
+        codes = np.unique(np.concatenate([n * slave + each for each in masters]))
+        return np.column_stack(divmod(np.unique(np.concatenate(self._comm.allgather(codes))), n))
 
 
 def body_of_points(contact: Contact, space: fem.FunctionSpace, body: npt.NDArray[np.intp]) -> Index:
-    """The body behind each of this rank's points of Γc, (n_points,)."""
+    """Return the slave body of each of this rank's points of Γc, (n_points,)."""
     rows = contact.quadrature.point_rows
     cells = facet_cells(space.mesh, contact.surface.facets)
     own = np.zeros(contact.quadrature.n_points, dtype=np.intp)

@@ -1,4 +1,4 @@
-"""The rigid motions of bodies and free obstacles, at unknowns and at the points of contacts."""
+"""Rigid motions of bodies and free obstacles, at the unknowns and at contact points."""
 
 from __future__ import annotations
 
@@ -21,21 +21,20 @@ __all__ = ["RigidMotions"]
 
 
 class RigidMotions:
-    """Translations and rotations of every body of a mesh, and the free motions of obstacles.
+    """Translations and rotations of every body, and the free motions of obstacles.
 
-    A body is a part of the mesh connected by its displacements. Rotations are about the body's
-    middle and scaled by its size, so that every motion is a displacement of order one. The
-    constructor is collective.
+    A body is a connected part of the mesh. Rotations are about its centre and scaled by its size,
+    so that all motions are displacements of order one. The constructor is collective.
 
     Args:
-        full: The system. Each free motion of an obstacle is a rigid motion of its own.
+        full: The system; each free motion of an obstacle is one rigid motion.
 
     Attributes:
-        comm: The ranks.
+        comm: MPI communicator.
         names: Name of every motion, those of the bodies first.
-        turns: Which of these turn a body, and the size of it by which the angle has to be
-            multiplied to be one of order one (length); 0 for the others.
-        obstacle_turns: Which of these are rotations of obstacles, whose arms change with the state.
+        turns: Size of the body for its rotations, whose angle times size is of order one (length);
+            0 for other motions.
+        is_obstacle_rotation: Mask of the rotations of obstacles, whose arms depend on the state.
         of_bodies: Translations, then rotations, of the undeformed bodies: at each of this rank's
             unknowns those of its own body, (n_per_body, n_local).
     """
@@ -48,158 +47,147 @@ class RigidMotions:
         self._n_bodies, self._centres, self._sizes = scales.n_bodies, scales.centre, scales.size
         self._displacement, self._unknowns, self._x = full.displacement, unknowns, x
         self.names: list[str] = []
-        turns: list[float] = []
+        lengths: list[float] = []
         for b, (centre, size) in enumerate(zip(self._centres, self._sizes, strict=True)):
             of = f" of body {b + 1}, near {place_in_words(centre)}" if self._n_bodies > 1 else ""
             for name in rigid_motions(x[:0], 1.0):
                 self.names.append(name + of)
-                turns.append(size if name.startswith("rotation") else 0.0)
-        moving = [(contact.name, m) for contact in full.contacts for m in contact.motions]
-        self.names += [f"{m.kind} {m.way} of the obstacle of {name}" for name, m in moving]
-        obstacle_turns = [False] * len(turns) + [m.turns for _, m in moving]
-        self.turns = np.array(turns + [0.0] * len(moving))
-        self.obstacle_turns = np.array(obstacle_turns, dtype=np.bool_)
+                lengths.append(size if name.startswith("rotation") else 0.0)
+        obstacles = [(contact.name, m) for contact in full.contacts for m in contact.motions]
+        self.names += [f"{m.kind} {m.way} of the obstacle of {name}" for name, m in obstacles]
+        is_obstacle_rotation = [False] * len(lengths) + [m.turns for _, m in obstacles]
+        self.turns = np.array(lengths + [0.0] * len(obstacles))
+        self.is_obstacle_rotation = np.array(is_obstacle_rotation, dtype=np.bool_)
         self.of_bodies = self._of_bodies_at(x)
-        self._travels: weakref.WeakKeyDictionary[ContactOperator, list[tuple[Index, Array]]]
-        self._travels = weakref.WeakKeyDictionary()
+        self._displacements: weakref.WeakKeyDictionary[ContactOperator, list[tuple[Index, Array]]]
+        self._displacements = weakref.WeakKeyDictionary()
 
     def _of_bodies_at(self, x: Array) -> Array:
-        """`of_bodies`, with the nodes of this rank at places, (n_per_body, n_local)."""
+        """Return `of_bodies` for positions x of this rank's nodes, (n_per_body, n_local)."""
         body = self._full.body[: len(x)]
         arm = (x - self._centres[body]) / self._sizes[body, None]
-        nothing = np.zeros(self._unknowns.n_motions)
-        motions = [self._over_unknowns(each, nothing) for each in rigid_motions(arm, 1.0).values()]
+        zero = np.zeros(self._unknowns.n_motions)
+        motions = [self._assemble_field(each, zero) for each in rigid_motions(arm, 1.0).values()]
         return np.array(motions)
 
-    def _over_unknowns(self, displacement: Array, obstacles: Array) -> Array:
-        """Displacements of this rank's nodes, (n_nodes, gdim), and of the obstacles."""
+    def _assemble_field(self, displacement: Array, obstacles: Array) -> Array:
+        """Return the unknowns for nodal displacements, (n_nodes, gdim), and obstacles."""
         return self._unknowns.joined(self._displacement.within(displacement.ravel()), obstacles)
 
-    def _by_part(self, coefficients: Array) -> tuple[Array, Array]:
-        """Coefficients of all motions by body, (n_bodies, n_per_body), and by obstacle."""
+    def _split(self, coefficients: Array) -> tuple[Array, Array]:
+        """Split coefficients into those of bodies, (n_bodies, n_per_body), and of obstacles."""
         n_modes = self._n_bodies * len(self.of_bodies)
         return coefficients[:n_modes].reshape(self._n_bodies, -1), coefficients[n_modes:]
 
     def field(
         self, by_body: Array, obstacles: Array | None = None, *, of_bodies: Array | None = None
     ) -> Array:
-        """The displacement by motions, at this rank's unknowns, (n_local,).
+        """Return the displacement field of motions at this rank's unknowns, (n_local,).
 
         Args:
             by_body: Coefficients of the first k motions of every body, (n_bodies, k).
-            obstacles: Of the motions of obstacles; None: these are at rest.
-            of_bodies: Motions of the bodies, if not of the undeformed ones; see the attribute.
+            obstacles: Coefficients of the motions of obstacles; None: all are zero.
+            of_bodies: Motions of the bodies, by default those of the undeformed ones.
         """
         motions = self.of_bodies if of_bodies is None else of_bodies
         n, label = self._unknowns.n_dofs, self._scales.label
         dofs = np.einsum("im,mi->i", by_body[label[:n]], motions[: by_body.shape[1], :n])
-        still = np.zeros(self._unknowns.n_motions)
-        return self._unknowns.joined(dofs, still if obstacles is None else obstacles)
+        zero = np.zeros(self._unknowns.n_motions)
+        return self._unknowns.joined(dofs, zero if obstacles is None else obstacles)
 
     def by_body(self, system: System, values: Array, of_bodies: Array | None = None) -> Array:
-        """Sums of values times the motions of each body, this rank's part.
+        """Return this rank's products of a system's values with motions, (n_bodies, n_per_body).
 
-        Args:
-            system: The unknowns.
-            values: At these.
-            of_bodies: See `field`.
-
-        Returns:
-            Array (n_bodies, n_per_body).
+        The motions are by default those of the undeformed bodies.
         """
         motions, n = self.of_bodies if of_bodies is None else of_bodies, self._n_bodies
         products = [system.part(motion) * values for motion in motions]
-        found = [np.bincount(system.label, p, minlength=n)[:n] for p in products]
-        return np.stack(found, axis=1).astype(np.float64)  # of none NumPy counts integers
+        sums = [np.bincount(system.label, p, minlength=n)[:n] for p in products]
+        return np.stack(sums, axis=1).astype(
+            np.float64
+        )  # `bincount` of an empty array is of integers
 
-    def _sums(self, values: Array, of_bodies: Array | None = None) -> Array:
-        """Sums of values at this rank's unknowns times all motions, (n_motions,)."""
+    def _sum_products(self, values: Array, of_bodies: Array | None = None) -> Array:
+        """Return this rank's products of values with all motions, (n_motions,)."""
         obstacles = np.zeros(self._unknowns.n_motions)
         if self._unknowns.has_motions_here:
             obstacles[:] = values[self._unknowns.n_dofs :]
         return np.append(self.by_body(self._full, values, of_bodies), obstacles)
 
     def turned(self, coefficients: Array) -> Array:
-        """By how much unknowns change as bodies go on, and turn about their centres, from here.
+        """Return the change of the unknowns, (n_local,), for finite motions from the present state.
 
-        Rotations are of any size.
-
-        Args:
-            coefficients: Of all motions, (n_motions,).
-
-        Returns:
-            Over this rank's unknowns, (n_local,).
+        The coefficients are of all motions, (n_motions,).
         """
-        x, (by_body, obstacles) = self._places(), self._by_part(coefficients)
-        way, d = np.zeros_like(x), x.shape[1]
+        x, (by_body, obstacles) = self._node_positions(), self._split(coefficients)
+        displacement, d = np.zeros_like(x), x.shape[1]
         for b, of_body in enumerate(by_body):
-            twist = np.zeros((d + 1, d + 1))  # of homogeneous coordinates
-            here = np.vstack([np.zeros(d), np.eye(d)])
-            kinds = np.array(list(rigid_motions(here, self._sizes[b]).values()))
-            at = np.tensordot(of_body, kinds, axes=1)
-            twist[:d, d], twist[:d, :d] = at[0], (at[1:] - at[0]).T
+            twist = np.zeros((d + 1, d + 1))  # in homogeneous coordinates
+            points = np.vstack([np.zeros(d), np.eye(d)])
+            modes = np.array(list(rigid_motions(points, self._sizes[b]).values()))
+            velocity = np.tensordot(of_body, modes, axes=1)
+            twist[:d, d], twist[:d, :d] = velocity[0], (velocity[1:] - velocity[0]).T
             change = scipy.linalg.expm(twist)[:d] - np.eye(d + 1)[:d]
-            mine = self._full.body[: len(x)] == b
-            way[mine] = (x[mine] - self._centres[b]) @ change[:, :d].T + change[:, d]
-        return self._over_unknowns(way, obstacles)
+            nodes = self._full.body[: len(x)] == b
+            displacement[nodes] = (x[nodes] - self._centres[b]) @ change[:, :d].T + change[:, d]
+        return self._assemble_field(displacement, obstacles)
 
-    def _places(self) -> Array:
-        """Of this rank's nodes now, (n_nodes, gdim) (length)."""
+    def _node_positions(self) -> Array:
+        """Return the present positions of this rank's nodes, (n_nodes, gdim) (length)."""
         n, d = self._x.shape
         return self._x + self._displacement.u.x.array[: n * d].reshape(n, d)
 
     def work(self, operator: ContactOperator, force: Array) -> Array:
-        """Of forces at a contact's points, and of what answers them, on the motions of the bodies.
+        """Return the work of contact forces on the motions of the bodies on both sides. Collective.
 
-        That of the body with Γc follows from where the points are, not from the map by which the
-        solver transfers forces. Collective.
+        The motion of the slave side follows from the positions of the points, independently of the
+        map that transfers the forces in the solver.
 
         Args:
-            operator: Of the contact, over all unknowns.
-            force: On the body with Γc, (n_points, gdim) (force).
+            operator: Operator of the contact, over all unknowns.
+            force: Forces on the slave body, (n_points, gdim) (force).
 
         Returns:
-            This rank's part, (n_bodies, n_per_body) (force): translations, then rotations about
-            the body's middle by its size.
+            This rank's part, (n_bodies, n_per_body) (force): translations, then rotations about the
+            centre divided by the size.
         """
-        if operator not in self._travels:
-            self._travels[operator] = self._travels_at(operator)
-        found: Array = np.zeros((self._n_bodies, len(self.of_bodies)))
-        for body, travels in self._travels[operator]:
-            np.add.at(found, body, np.einsum("mqd,qd->qm", travels, force))
-        return found
+        if operator not in self._displacements:
+            self._displacements[operator] = self._displacements_at(operator)
+        result: Array = np.zeros((self._n_bodies, len(self.of_bodies)))
+        for body, displacements in self._displacements[operator]:
+            np.add.at(result, body, np.einsum("mqd,qd->qm", displacements, force))
+        return result
 
-    def _travels_at(self, operator: ContactOperator) -> list[tuple[Index, Array]]:
-        """Bodies on both sides of points, and what these feel of their motions. Collective.
+    def _displacements_at(self, operator: ContactOperator) -> list[tuple[Index, Array]]:
+        """Return bodies and their rigid displacements on both sides of the points. Collective.
 
-        Returns:
-            Arrays (n_points,) and (n_per_body, n_points, gdim) for every side.
+        For every side they are arrays (n_points,) and (n_per_body, n_points, gdim).
         """
         space, contact = self._displacement.u.function_space, operator.contact
-        own = body_of_points(contact, space, self._full.body)
-        arm = (contact.points - self._centres[own]) / self._sizes[own, None]
-        travels = np.array(list(rigid_motions(arm, 1.0).values()))
-        sides = [(own, travels)]
+        slave = body_of_points(contact, space, self._full.body)
+        arm = (contact.points - self._centres[slave]) / self._sizes[slave, None]
+        displacements = np.array(list(rigid_motions(arm, 1.0).values()))
+        sides = [(slave, displacements)]
         if not contact.rigid:
-            # The map says where the forces on the opposite act. Both sides may be one body's.
-            # A point without an opposite feels none: a traction there would be left over.
-            felt = np.array([operator.jump(motion) for motion in self.of_bodies])
+            # The jump map gives the displacement of the master side, which may be the same body.
+            # Tractions at unpaired points stay unbalanced.
+            jumps = np.array([operator.jump(motion) for motion in self.of_bodies])
             difference = operator.jump(self._scales.label.astype(np.float64))[:, 0]
             paired = contact.paired[:, None]
-            opposite = np.where(contact.paired, own - np.rint(difference).astype(np.intp), own)
-            sides.append((opposite, np.where(paired, felt - travels, 0.0)))
+            master = np.where(contact.paired, slave - np.rint(difference).astype(np.intp), slave)
+            sides.append((master, np.where(paired, jumps - displacements, 0.0)))
         if compat.geometry_element(space.mesh).degree > space.ufl_element().degree:
-            # Straight displacements of curved cells have no rotations.
+            # Displacements of lower degree than the geometry contain no rotations.
             for _, each in sides:
                 each[space.mesh.geometry.dim :] = np.nan
         return sides
 
     def describe(self, coefficients: Array) -> str:
-        """Name a motion by its share of each of all motions, (n_motions,)."""
-        share = np.abs(coefficients) / np.abs(coefficients).max()
+        """Describe a combination of all motions, (n_motions,), in words."""
+        fractions = np.abs(coefficients) / np.abs(coefficients).max()
         terms = [
-            name if s > 1 - FLAT else f"{s:.2g} of {name}"
-            for name, s in zip(self.names, share, strict=True)
-            if s > FLAT
+            name if fraction > 1 - FLAT else f"{fraction:.2g} of {name}"
+            for name, fraction in zip(self.names, fractions, strict=True)
+            if fraction > FLAT
         ]
         return " with ".join(terms)

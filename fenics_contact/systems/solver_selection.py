@@ -1,4 +1,4 @@
-"""Which system to iterate on, and how to solve linear systems over all unknowns."""
+"""Selection of the system to iterate on, and of the solver for systems over all unknowns."""
 
 from __future__ import annotations
 
@@ -21,57 +21,57 @@ def reason_not_to_condense(
     increments: int,
     n_retained: int,
 ) -> str | None:
-    """Why not to iterate on the unknowns that contact touches alone; None: do. Collective.
+    """Return why static condensation is not used; None if it is. Collective.
 
     Args:
-        full: All unknowns.
-        wanted: What the caller says; None: where it can be done and is worth it.
-        linear_solver: What the caller wants for systems over all unknowns.
-        named: Options given that name a linear solver, which the dense one cannot be.
-        increments: How many of them are expected.
-        n_retained: How many unknowns there would be.
+        full: The system on all unknowns.
+        wanted: The user's choice; None: condense if possible and worthwhile.
+        linear_solver: The user's choice for systems over all unknowns.
+        named: Options given that select a linear solver, which excludes the dense one.
+        increments: Expected number of increments.
+        n_retained: Number of unknowns to retain.
 
     Raises:
-        ValueError: It is wanted and cannot be had.
+        ValueError: It is requested and impossible.
     """
     unknowns, gdim = full.unknowns, full.gdim
-    obstacle = None
+    reason = None
     if not full.contacts:
-        obstacle = "there is no contact"
+        reason = "there is no contact"
     elif not full.bulk.linear:
-        obstacle = "the bulk is not linear in u"
+        reason = "the bulk is not linear in u"
     elif full.displacement.mixed:
-        obstacle = "the displacement is a part of a mixed function"
-    elif full.follows and not full.scales.held.all():
-        obstacle = "bodies with finite kinematics are constrained by contact only"
-    elif full.follows and not all_retained(unknowns.n_global, _n_touched(full), gdim):
-        obstacle = "finite kinematics couple more dofs than can be retained"
+        reason = "the displacement is a part of a mixed function"
+    elif full.follows and not full.scales.constrained.all():
+        reason = "bodies with finite kinematics are constrained by contact only"
+    elif full.follows and not all_retained(unknowns.n_global, _count_coupled(full), gdim):
+        reason = "finite kinematics couple more dofs than can be retained"
     elif named:
-        obstacle = f"the options name a linear solver ({', '.join(named)})"
+        reason = f"the options name a linear solver ({', '.join(named)})"
     elif linear_solver == "multigrid":
-        obstacle = "linear_solver is 'multigrid', and condensation needs a factorisation"
-    if wanted and obstacle:
-        raise ValueError(
-            f"condensation is True, but {obstacle}; omit it, or give condensation=False"
-        )
+        reason = "linear_solver is 'multigrid', and condensation needs a factorisation"
+    if wanted and reason:
+        raise ValueError(f"condensation is True, but {reason}; omit it, or give condensation=False")
     if wanted is False:
         return "condensation is False"
-    if wanted or obstacle:
-        return obstacle
+    if wanted or reason:
+        return reason
     n = unknowns.n_global
     if n_retained == n or not worthwhile(n, n_retained, gdim):
         return f"contact couples {n_retained} of {n} unknowns, too many for it to save time"
     if unknowns.n_motions or linear_solver is not None:
         return None
     n_bytes = linear.factor_bytes(n, gdim, symmetric=full.bulk.symmetric)
-    obstacle = linear.too_large(n_bytes, unknowns.comm)
-    if not obstacle and linear.quicker(full.size_to_factor, gdim, condensed_for=increments):
-        obstacle = f"multigrid is faster for {n} unknowns"
-    return obstacle or None
+    reason = linear.describe_memory_excess(n_bytes, unknowns.comm)
+    if not reason and linear.is_multigrid_faster(
+        full.size_to_factor, gdim, condensed_for=increments
+    ):
+        reason = f"multigrid is faster for {n} unknowns"
+    return reason or None
 
 
-def _n_touched(full: FullSystem) -> int:
-    """How many unknowns contact touches, or may touch with other pairs. Collective."""
+def _count_coupled(full: FullSystem) -> int:
+    """Count the unknowns that contact couples, or may couple with other pairs. Collective."""
     return int(full.unknowns.comm.allreduce(touched(full.operators, full.unknowns).size))
 
 
@@ -84,18 +84,18 @@ def linear_kind(
     symmetric: bool,
     tangent_symmetric: bool,
 ) -> tuple[str, str]:
-    """How to solve systems over all unknowns, one of `linear.KINDS`, and why. Collective.
+    """Return one of `linear.KINDS` for systems over all unknowns, and the reason. Collective.
 
     Args:
-        full: All unknowns.
-        wanted: What the caller says.
-        condensed: Whether another system is iterated on.
-        named: Options given that name a linear solver; they win.
-        symmetric: Whether the matrix of H₀ is.
-        tangent_symmetric: Whether the consistent tangent is.
+        full: The system on all unknowns.
+        wanted: The user's choice.
+        condensed: Whether the iteration is on a condensed system.
+        named: Options given that select a linear solver; they take precedence.
+        symmetric: Whether the matrix of H₀ is symmetric.
+        tangent_symmetric: Whether the consistent tangent is symmetric.
 
     Raises:
-        ValueError: The caller wants what cannot work.
+        ValueError: The user's choice does not work.
     """
     kind, reason = wanted, "chosen by linear_solver"
     if full.displacement.mixed:
@@ -111,8 +111,8 @@ def linear_kind(
         n_bytes = linear.factor_bytes(n, gdim, symmetric=symmetric)
         if not tangent_symmetric:  # L-BFGS keeps the factors of both
             n_bytes += linear.factor_bytes(n, gdim, symmetric=False)
-        reason = linear.too_large(n_bytes, full.unknowns.comm) or ""
-        if not reason and linear.quicker(full.size_to_factor, gdim):
+        reason = linear.describe_memory_excess(n_bytes, full.unknowns.comm) or ""
+        if not reason and linear.is_multigrid_faster(full.size_to_factor, gdim):
             reason = "it is faster for this size"
         kind = "multigrid" if reason and not condensed and not named else "direct"
     if kind == "multigrid" and full.unknowns.n_motions:

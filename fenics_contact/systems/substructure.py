@@ -1,7 +1,4 @@
-"""A piece of a body with its inner unknowns eliminated: the stiffness that its boundary feels.
-
-MUMPS leaves the dense Schur complement of the boundary with the factors of the inner unknowns.
-"""
+"""Elimination of the inner unknowns of a substructure by MUMPS, down to the Schur complement."""
 
 from __future__ import annotations
 
@@ -24,21 +21,20 @@ SINGULAR = (
 
 
 class Substructure:
-    """A stiffness whose inner unknowns are factored. Of this rank alone: nothing is collective.
+    """Factorisation of the inner unknowns of a stiffness, on this rank alone.
 
     Args:
-        stiffness: Of this rank alone, (n, n); used.
-        boundary: Numbers of the unknowns that stay, ascending, (n_boundary,).
-        symmetric: Whether the stiffness is.
-        prefix: Of the options of the factorisation.
+        stiffness: Stiffness, (n, n), taken over.
+        boundary: Numbers of the retained unknowns, ascending, (n_boundary,).
+        symmetric: Whether the stiffness is symmetric.
+        prefix: Options prefix of the factorisation.
 
     Attributes:
-        schur: What is left for the boundary, (n_boundary, n_boundary), Fortran order
-            (force/length).
+        schur: Schur complement, (n_boundary, n_boundary), Fortran order (force/length).
 
     Raises:
-        RuntimeError: The stiffness is singular even with the boundary held.
-        MemoryError: There is not enough.
+        RuntimeError: The stiffness is singular even with the boundary fixed.
+        MemoryError: The factorisation ran out of memory.
     """
 
     def __init__(
@@ -63,11 +59,11 @@ class Substructure:
         self._pc.setFromOptions()
         self._pc.setFactorSetUpSolverType()
         self._factor = self._pc.getFactorMatrix()
-        # MUMPS' estimate of its workspace is short where the Schur complement is most of it.
+        # MUMPS underestimates its workspace if the Schur complement dominates.
         self._factor.setMumpsIcntl(14, 400)
         if boundary.size:
             chosen = PETSc.IS().createGeneral(boundary, comm=PETSc.COMM_SELF)
-            _call("MatFactorSetSchurIS", _object(self._factor), _object(chosen))
+            _call_petsc("MatFactorSetSchurIS", _handle(self._factor), _handle(chosen))
         self._pc.setUp()
         error = self._factor.getMumpsInfog(1)
         if linear.refused_memory(self._pc):
@@ -78,27 +74,29 @@ class Substructure:
         self.schur = self._schur_complement() if boundary.size else np.zeros((0, 0), order="F")
         if error < 0 or not np.all(np.isfinite(self.schur)):
             raise RuntimeError(f"{SINGULAR} (MUMPS error {error})")
-        # Solutions with the boundary at rest, and not of the whole.
+        # Solve with the inner unknowns only.
         self._factor.setMumpsIcntl(26, 0)
 
     def _schur_complement(self) -> Array:
         n = self._boundary.size
         found, status, values = ctypes.c_void_p(), ctypes.c_int(), ctypes.POINTER(ctypes.c_double)()
-        factor = _object(self._factor)
-        _call("MatFactorCreateSchurComplement", factor, ctypes.byref(found), ctypes.byref(status))
-        _call("MatDenseGetArrayRead", found, ctypes.byref(values))
+        factor = _handle(self._factor)
+        _call_petsc(
+            "MatFactorCreateSchurComplement", factor, ctypes.byref(found), ctypes.byref(status)
+        )
+        _call_petsc("MatDenseGetArrayRead", found, ctypes.byref(values))
         array = np.ctypeslib.as_array(values, (n, n)).T.copy(order="F")
-        _call("MatDenseRestoreArrayRead", found, ctypes.byref(values))
-        _call("MatDestroy", ctypes.byref(found))
+        _call_petsc("MatDenseRestoreArrayRead", found, ctypes.byref(values))
+        _call_petsc("MatDestroy", ctypes.byref(found))
         return array
 
     def release(self) -> Array:
-        """`schur`, which is not retained any more."""
+        """Return `schur` and drop it."""
         schur, self.schur = self.schur, np.zeros((0, 0))
         return schur
 
-    def at_rest(self, force: Array) -> Array:
-        """Displacement of the inner unknowns under forces on them, with the boundary at rest."""
+    def solve_fixed(self, force: Array) -> Array:
+        """Return the inner unknowns under forces on them, with the boundary at zero."""
         if not self._inner.size:
             return np.zeros(0)
         self._left.array[:] = 0.0
@@ -106,31 +104,31 @@ class Substructure:
         self._factor.solve(self._left, self._right)
         return np.asarray(self._right.array_r[self._inner])
 
-    def carried(self, boundary: Array) -> Array:
-        """Displacement of the inner unknowns that the boundary's brings along, without load."""
-        return self.at_rest(-self._product(self._boundary, boundary)[self._inner])
+    def extend(self, boundary: Array) -> Array:
+        """Return the harmonic extension of boundary values to the inner unknowns."""
+        return self.solve_fixed(-self._product(self._boundary, boundary)[self._inner])
 
     def reaction(self, inner: Array) -> Array:
-        """Force that the boundary at rest feels, (n_boundary,), for inner displacements."""
+        """Return the reactions of a fixed boundary, (n_boundary,), to inner values."""
         return self._product(self._inner, inner)[self._boundary]
 
     def _product(self, numbers: Indices, values: Array) -> Array:
-        """The stiffness times displacements of some unknowns, (n,)."""
+        """Multiply the stiffness by values of some unknowns, (n,)."""
         self._right.array[:] = 0.0
         self._right.array[numbers] = values
         self._stiffness.mult(self._right, self._left)
         return self._left.array_r.copy()
 
 
-def _object(item: PETSc.Object) -> ctypes.c_void_p:
+def _handle(item: PETSc.Object) -> ctypes.c_void_p:
     return ctypes.c_void_p(item.handle)
 
 
-def _call(name: str, *arguments: Any) -> None:
-    """A function of PETSc that petsc4py does not wrap.
+def _call_petsc(name: str, *arguments: Any) -> None:
+    """Call a function of PETSc that petsc4py does not wrap.
 
     Raises:
-        RuntimeError: It failed, or this PETSc does not have it.
+        RuntimeError: It fails, or this PETSc does not have it.
     """
     function = getattr(ctypes.CDLL(petsc4py.PETSc.__file__), name, None)
     if function is None:

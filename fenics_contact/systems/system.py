@@ -1,8 +1,7 @@
-"""A system: unknowns, and the equations of bulk and contact on them.
+"""The discrete equations of bulk and contact on a set of unknowns.
 
-There are two, side by side: `FullSystem` on all unknowns, and `CondensedSystem` on those that
-contact touches, all others eliminated. What both have in common is here; what iterates on one of
-them needs no more than this.
+`FullSystem` has all unknowns, `CondensedSystem` those retained by static condensation. Methods use
+the common interface in this module.
 """
 
 from __future__ import annotations
@@ -29,30 +28,30 @@ from fenics_contact.types import Array, Mask
 
 __all__ = ["System"]
 
-# How far an obstacle may turn in an increment whose angle is found: a right angle.
-_TURN = np.pi / 2
+# Largest rotation of a free obstacle in an increment.
+_MAX_ROTATION = np.pi / 2
 
 
 class System(ABC):
     """States, forces and matrices over some unknowns of a problem. The constructor is collective.
 
     Attributes:
-        u: What is solved for.
+        u: The solution function.
         gdim: Dimension of space.
         unknowns: The unknowns of the system.
         bulk: The bulk form.
         contacts: The contacts.
-        constrained: Mask over this rank's unknowns: those with Dirichlet conditions.
+        constrained: Mask of this rank's unknowns with Dirichlet conditions.
         prescribed: Values at them, in the present increment.
         load: External forces at the unknowns (force).
         diagonal: Diagonal of the matrix assembled last (force/length).
-        outside: Norms of load and of `terms` at unknowns outside of the system, (2, n_bodies).
+        outside: Norms of load and `terms` at unknowns outside of the system, (2, n_bodies).
         label: Body or free obstacle of every unknown of this rank, (n_local,).
-        n_bodies: Their number.
+        n_bodies: Number of bodies and free obstacles.
         scales: Reference scales of the bodies.
-        linear_kind: How linear systems are solved, one of `linear.KINDS`.
-        coordinate_id: Of the coordinates that `forces` are in.
-        ready: Whether `fill` can be called; else `update` comes first.
+        linear_kind: Solver of linear systems, one of `linear.KINDS`.
+        coordinate_id: Identifies the coordinates of `forces`.
+        ready: Whether `fill` can be called; otherwise `update` is necessary.
     """
 
     linear_kind = "direct"
@@ -82,24 +81,24 @@ class System(ABC):
         self._contact_vector = unknowns.vector()
         counts = [len(contact.motions) for contact in contacts]
         self._first_motions = [sum(counts[:i]) for i in range(len(counts))]
-        # Of every contact, with the number of the pairs that it was made for.
+        # Operator of every contact and the number of its pairs.
         self._operators: dict[int, tuple[int, ContactOperator]] = {}
         self._parts: tuple[list[int], Parts] | None = None
-        self._touched: tuple[list[int], Array] | None = None
+        self._coordinate_bounds: tuple[list[int], Array] | None = None
 
     @property
     @abstractmethod
     def iterations_per_round(self) -> int:
-        """Iterations of L-BFGS after which H₀ is made anew from the status."""
+        """Iterations of L-BFGS between two assemblies of H₀."""
 
-    # ---- contact, and what has to be in balance --------------------------------------------------
+    # ---- contact and force balance ---------------------------------------------------------------
 
     @property
     def operators(self) -> list[ContactOperator]:
-        """What the contacts are over these unknowns, with the pairs as they are. Collective.
+        """The contact operators for the present pairs. Collective.
 
-        Pairs that follow the bodies are found for the present ``u`` first. A contact whose pairs
-        are others than before gets another operator, and it alone: no operator changes.
+        Pairs that follow the bodies are updated to the present ``u``. An operator is replaced if,
+        and only if, the pairs of its contact have changed.
         """
         for contact in self.contacts:
             if contact.contact_kinematics.follows:
@@ -113,21 +112,21 @@ class System(ABC):
 
     @property
     def parts(self) -> Parts:
-        """What has to be in balance, for the present pairs. Collective."""
+        """The partition into bodies, obstacles and contacts, for the present pairs. Collective."""
         pairings = [c.pairs.number for c in self.contacts]
         if self._parts is None or self._parts[0] != pairings:
             moving = [(n, m.way) for n, c in enumerate(self.contacts) for m in c.motions]
             n = self.n_bodies - len(moving)
             bodies = [f"body {b + 1}" if n > 1 else "the body" for b in range(n)]
             bodies += [f"obstacle of {self.contacts[c].name} {way}" for c, way in moving]
-            touched = [operator.touched for operator in self.operators]
+            coupled = [operator.touched for operator in self.operators]
             scales = self.scales
             parts = Parts(
                 self.unknowns.comm,
                 self.label,
                 bodies,
                 [c.name for c in self.contacts],
-                touched,
+                coupled,
                 [scales.pairs(o, i, self.label) for i, o in enumerate(self.operators)],
                 scales,
                 [c for c, _ in moving],
@@ -136,11 +135,11 @@ class System(ABC):
         return self._parts[1]
 
     def contact_forces(self, *, evaluated: bool = False) -> list[Array]:
-        """Parts of the residual at the present state by contact, (n_local,) each. Collective.
+        """Return the residual contributions of each contact, (n_local,) each. Collective.
 
         Args:
-            evaluated: Whether tractions are those that `Contact.evaluate` found last, and not the
-                law's with its data as they are now.
+            evaluated: Whether to use the tractions of the last `Contact.evaluate` instead of those
+                of the law with its present data.
         """
         return [
             self._nodal_force(operator, operator.contact.traction if evaluated else None)
@@ -148,22 +147,22 @@ class System(ABC):
         ]
 
     def _nodal_force(self, operator: ContactOperator, traction: Array | None) -> Array:
-        """See `ContactOperator.add_force`, (n_local,). Collective."""
+        """Return the residual contribution of tractions, (n_local,). Collective."""
         self._contact_vector.set(0.0)
         operator.add_force(self._contact_vector, traction)
         return np.array(self._contact_vector.array_r)
 
     def contact_force(self) -> Array:
-        """Their sum, (n_local,). Collective."""
+        """Return the residual contribution of all contacts, (n_local,). Collective."""
         return sum(self.contact_forces(), np.zeros(self.unknowns.n_local))
 
     def norms(self, total: Array, contacts: Sequence[Array], start: InitialForces) -> Norms:
-        """How large residual and forces are at the present state, by part. Collective.
+        """Evaluate the norms of residual and forces at the present state, by part. Collective.
 
         Args:
-            total: The residual with reactions, (n_local,) (force).
-            contacts: Of every contact the part that is its own, (n_local,) each.
-            start: Forces at the beginning of the increment.
+            total: The residual including reactions, (n_local,) (force).
+            contacts: Contribution of every contact, (n_local,) each.
+            start: Forces at the start of the increment.
         """
         return self.parts.norms(
             total,
@@ -176,7 +175,7 @@ class System(ABC):
         )
 
     def initial_forces(self) -> InitialForces:
-        """Forces in the committed state, those of the bulk not evaluated yet. Collective."""
+        """Return the forces of the committed state, without internal ones. Collective."""
         forces = [np.zeros(self.unknowns.n_local) for _ in self.contacts]
         for operator, force in zip(self.operators, forces, strict=True):
             points = operator.contact.states.committed.points
@@ -187,122 +186,120 @@ class System(ABC):
 
     @property
     def confined(self) -> bool:
-        """Whether there are points of Γc that feel unknowns outside of the system. Collective."""
+        """Whether some points of Γc depend on unknowns outside of the system. Collective."""
         return any(operator.within is not None for operator in self.operators)
 
     @contextmanager
     def restricted_contacts(self) -> Iterator[None]:
-        """Confine the contacts to what the system has of Γc inside of the block. Collective.
+        """Restrict the contacts inside of the block to points within the system. Collective.
 
-        What the others feel is not known before `complete`.
+        The jump at the others is unknown until `complete`.
         """
-        confined = [o for o in self.operators if o.within is not None]
+        restricted = [o for o in self.operators if o.within is not None]
         try:
-            for operator in confined:
+            for operator in restricted:
                 operator.contact.restrict_to(operator.within)
             yield
         finally:
-            for operator in confined:
+            for operator in restricted:
                 operator.contact.restrict_to()
 
     # ---- states ----------------------------------------------------------------------------------
 
     def vector(self) -> PETSc.Vec:
-        """A new vector over the unknowns. Collective."""
+        """Create a vector over the unknowns. Collective."""
         return self.unknowns.vector()
 
     def terms(self, state: Array) -> Array:
-        """Size of what K u sums up in each row, whose round-off is left in it (force).
+        """Return the magnitude of the terms of K u, which bounds its round-off (force). Collective.
 
-        With finite kinematics contact sums up places in the place of displacements, between two
-        bodies the displacements of both. Collective.
+        Finite kinematics sum up coordinates, and contact of two bodies the displacements of both.
         """
         size = np.abs(state)
         for operator in self.operators:
             if not operator.contact.rigid:
-                touched = operator.touched
-                size[touched] = global_max(self.unknowns.comm, size[touched])
-        return np.asarray(self.diagonal * (size + self._coordinates()))
+                coupled = operator.touched
+                size[coupled] = global_max(self.unknowns.comm, size[coupled])
+        return np.asarray(self.diagonal * (size + self._largest_coordinates()))
 
-    def _coordinates(self) -> Array:
-        """Largest coordinate of a finite contact at what it touches, 0 elsewhere. Collective."""
+    def _largest_coordinates(self) -> Array:
+        """Return the largest coordinate at dofs of finite contacts, 0 elsewhere. Collective."""
         pairings = [c.pairs.number for c in self.contacts]
-        if self._touched is None or self._touched[0] != pairings:
-            found = np.zeros(self.unknowns.n_local)
+        if self._coordinate_bounds is None or self._coordinate_bounds[0] != pairings:
+            bounds = np.zeros(self.unknowns.n_local)
             for operator in self.operators:
                 if operator.contact.finite:
                     points = np.abs(operator.contact.points)
-                    found[operator.touched] = global_max(self.unknowns.comm, points)
-            self._touched = [c.pairs.number for c in self.contacts], found
-        return self._touched[1]
+                    bounds[operator.touched] = global_max(self.unknowns.comm, points)
+            self._coordinate_bounds = [c.pairs.number for c in self.contacts], bounds
+        return self._coordinate_bounds[1]
 
     def by_body(self, *vectors: Array) -> Array:
-        """Norms of vectors over the unknowns, (n_vectors, n_bodies). Collective."""
+        """Return the norms of vectors by body, (n_vectors, n_bodies). Collective."""
         return by_body(self.unknowns.comm, vectors, self.label, self.n_bodies)
 
     def motions(self) -> Array:
-        """The present free motions of obstacles, on every rank."""
+        """Return the present free motions of obstacles, on every rank."""
         return np.array([motion.value for motion in self._motions])
 
     def set_motions(self, state: Array) -> None:
-        """Make those of a state the present ones. Collective."""
+        """Set the free motions of obstacles from a state. Collective."""
         for motion, value in zip(self._motions, self.unknowns.motions(state), strict=True):
             motion.set_value(value)
 
     def is_twisted(self) -> bool:
-        """Whether an obstacle that turns freely has turned too far.
+        """Return whether a free obstacle has rotated by more than a right angle.
 
-        A turn further its points are where they were: to a solution there are others.
+        Solutions are not unique beyond: after a full turn its points are at the same positions.
         """
-        turns = (
+        angles = (
             float(contact.free_angle.value) - contact.contact_kinematics.committed_angle
             for contact in self.contacts
             if contact.free_angle is not None
         )
-        return any(not abs(turn) < _TURN for turn in turns)
+        return any(not abs(angle) < _MAX_ROTATION for angle in angles)
 
     def is_degenerate(self) -> bool:
-        """Whether Γc has lost its tangent plane somewhere; see `Pairs.degenerate`."""
+        """Return whether Γc has lost its tangent plane at a point."""
         return any(contact.pairs.degenerate for contact in self.contacts)
 
     @abstractmethod
     def state(self) -> Array:
-        """The present unknowns of this rank; a copy."""
+        """Return the present unknowns of this rank, a copy."""
 
     @abstractmethod
     def set_state(self, state: Array) -> None:
-        """Make a state the present one. Collective."""
+        """Set the present unknowns. Collective."""
 
     def part(self, state: Array) -> Array:
-        """What of a state of all unknowns is in this system, by default all of it. Collective."""
+        """Restrict a state of all unknowns to this system. Collective."""
         return state
 
     def extended(self, change: Array) -> Array:
-        """The change of all unknowns that one of those in this system brings along. Collective."""
+        """Extend a change of the unknowns of this system to all. Collective."""
         return change
 
     # ---- an increment ----------------------------------------------------------------------------
 
     @abstractmethod
     def begin(self, load: Array) -> None:
-        """Start an increment under a load over all unknowns, u with its conditions. Collective."""
+        """Start an increment under a load, with the Dirichlet values in u. Collective."""
 
     @property
     def pending_field(self) -> Array | None:
-        """What `complete` needs of the present increment; None: nothing is outside."""
+        """Data for `complete` in this increment; None: no unknowns are outside."""
         return None
 
     def complete(self, field: Array | None) -> None:
-        """Find the unknowns outside of the system for those inside, if there are any. Collective.
+        """Recover the unknowns outside of the system from those inside. Collective.
 
-        Args:
-            field: What `pending_field` was in the increment that set those inside.
+        The field is the `pending_field` of the increment that determined those inside.
         """
         return
 
     @abstractmethod
     def forces(self, bulk: Array, reaction: Array) -> Forces:
-        """For the energies: forces at the present state, in the coordinates of ``coordinate_id``.
+        """Return the forces at the present state, in the coordinates of ``coordinate_id``.
 
         Args:
             bulk: Residual of the bulk, (n,) (force).
@@ -310,68 +307,53 @@ class System(ABC):
         """
 
     def present_forces(self, bulk: Array | None = None) -> Forces:
-        """`forces` of the present state, with the reactions that balance it. Collective.
-
-        Args:
-            bulk: Residual of the bulk, by default `bulk_force`.
-        """
+        """Return `forces` with the reactions in equilibrium with the bulk residual. Collective."""
         bulk = self.bulk_force() if bulk is None else bulk
         return self.forces(bulk, np.where(self.constrained, bulk + self.contact_force(), 0.0))
 
     @abstractmethod
     def forget(self) -> None:
-        """Drop what was retained of earlier increments and could show in the digits of the next."""
+        """Drop data of earlier increments that could change the round-off of the next."""
 
     @abstractmethod
     def bulk_force(self) -> Array:
-        """The residual without contact's: the bulk's and the free obstacles'. Collective."""
+        """Return the residual of the bulk and of free obstacles, without contact. Collective."""
 
     @abstractmethod
     def bulk_energy(self) -> float:
-        """This rank's part of the potential of a linear bulk and its loads, up to a constant."""
+        """Return this rank's potential of a linear bulk and its loads, up to a constant."""
 
     # ---- matrices --------------------------------------------------------------------------------
 
     def update(self) -> int:
-        """Take the bulk's tangent as it is now; number of factorisations. Collective.
-
-        By default `fill` takes it as it is.
-        """
+        """Update the bulk tangent; return the number of factorisations. Collective."""
         return 0
 
     @abstractmethod
     def matrix(self, *, symmetric: bool) -> PETSc.Mat:
-        """A new matrix for `fill`. Collective.
-
-        Args:
-            symmetric: Whether what will be filled in is symmetric.
-        """
+        """Create a matrix for `fill`, whose values will be symmetric or not. Collective."""
 
     @abstractmethod
     def bulk_diagonal(self) -> Array:
-        """Diagonal of the bulk's tangent at this rank's unknowns, (n_local,) (force/length)."""
+        """Return the diagonal of the bulk tangent at this rank's unknowns (force/length)."""
 
     @abstractmethod
     def linear_solver(self, *, symmetric: bool, accurate: bool) -> dict[str, Any]:
-        """Options of the solver for `matrix`; see `linear.options`."""
+        """Return the options of the solver for `matrix`."""
 
     def prepare(self, ksp: PETSc.KSP, matrix: PETSc.Mat) -> None:
-        """Give a solver a matrix of `matrix`. Collective."""
+        """Set a matrix of `matrix` in a solver. Collective."""
         ksp.setOperators(matrix)
 
     @property
     def pattern_changes(self) -> bool:
-        """Whether what `fill` makes has another pattern each time."""
+        """Whether the sparsity pattern of `fill` changes from one matrix to the next."""
         return False
 
     @abstractmethod
     def fill(self, matrix: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> int:
-        """Bulk tangent plus contact, conditions applied, dimensionless. Collective.
+        """Assemble bulk and contact tangents with Dirichlet conditions, dimensionless. Collective.
 
-        Args:
-            matrix: What to fill.
-            contacts: Contact's part, used up.
-
-        Returns:
-            How many factorisations of sparse matrices this leads to.
+        The contact tangents are destroyed. The result is the number of sparse factorisations that
+        solving with the matrix takes.
         """

@@ -1,7 +1,6 @@
 """The unknowns of a problem: the dofs of the displacement, then the free motions of obstacles.
 
-The motions stand at the end of the last rank's rows, so that the global numbers of the dofs are
-those of DOLFINx with them and without them.
+The motions are the last rows of the last rank, so that dofs keep their DOLFINx numbers.
 """
 
 from __future__ import annotations
@@ -18,18 +17,18 @@ __all__ = ["DofSubset", "Unknowns"]
 
 
 class Unknowns:
-    """How the unknowns lie on the ranks. The constructor is collective.
+    """The distribution of the unknowns over the ranks. The constructor is collective.
 
     Attributes:
-        n_dofs: Dofs of the displacement that this rank owns.
-        n_motions: Free motions of obstacles, in all.
-        n_local: Unknowns of this rank: its dofs, and the motions on the last one.
-        n_global: Unknowns of all ranks.
-        first: Global number of the first one of this rank.
+        n_dofs: Number of dofs that this rank owns.
+        n_motions: Number of free motions of obstacles on all ranks.
+        n_local: Number of unknowns of this rank: its dofs, and on the last rank the motions.
+        n_global: Number of unknowns on all ranks.
+        first: Global number of the first unknown of this rank.
         first_motion: Global number of the first motion.
-        motions_on: The rank that has them.
-        whole: All unknowns, of which these may be a `DofSubset`.
-        retained: Numbers of these among this rank's share of all, ascending.
+        motions_on: The rank that owns the motions.
+        whole: All unknowns; a `DofSubset` refers to them.
+        retained: Numbers of these unknowns among all of this rank, ascending.
     """
 
     def __init__(self, space: fem.FunctionSpace, n_motions: int = 0) -> None:
@@ -47,110 +46,105 @@ class Unknowns:
         self.retained: npt.NDArray[np.int32] = np.arange(self.n_local, dtype=np.int32)
 
     def vector(self) -> PETSc.Vec:
-        """A new vector over the unknowns. Collective."""
+        """Create a vector over the unknowns. Collective."""
         return PETSc.Vec().createMPI((self.n_local, None), comm=self.comm)
 
     def joined(self, dofs: Array, motions: Array) -> Array:
-        """This rank's unknowns, of its dofs and all motions."""
+        """Concatenate this rank's dofs and, on the rank that owns them, the motions."""
         return np.concatenate([dofs, motions]) if self.has_motions_here else dofs.copy()
 
     def motions(self, values: Array) -> Array:
-        """The motions out of the ranks' unknowns, on every rank. Collective."""
+        """Return the motions among the values of the unknowns, on every rank. Collective."""
         if self.n_motions == 0:
             return np.zeros(0)
-        mine = values[self.n_dofs :] if self.has_motions_here else None
-        return np.asarray(self.comm.bcast(mine, root=self.motions_on), dtype=np.float64)
+        own = values[self.n_dofs :] if self.has_motions_here else None
+        return np.asarray(self.comm.bcast(own, root=self.motions_on), dtype=np.float64)
 
-    def gathered(self, values: Array) -> Array:
-        """Values at this rank's unknowns, of those at `retained` on every rank. Collective.
+    def gather(self, values: Array) -> Array:
+        """Gather values at `retained` of every rank on the ranks of these unknowns. Collective.
 
-        The same, but for a `DofSubset`.
+        It is the identity except for a `DofSubset`.
         """
         return values
 
-    def scattered(self, values: Array) -> Array:
-        """The inverse of `gathered`. Collective."""
+    def scatter(self, values: Array) -> Array:
+        """Invert `gather`. Collective."""
         return values
 
-    def widened(self, matrix: PETSc.Mat, *, rows: bool = False) -> PETSc.Mat:
-        """A matrix over the dofs as one over the unknowns, zero at the motions. Collective.
+    def widen(self, matrix: PETSc.Mat, *, rows: bool = False) -> PETSc.Mat:
+        """Extend a matrix over the dofs by the motions, with zeros. Collective.
 
-        Rows of motions have their diagonal entry: PETSc sets conditions in no others.
+        Rows of motions get a diagonal entry, which PETSc needs for Dirichlet conditions.
 
         Args:
-            matrix: Its columns, and with ``rows`` its rows too, are dofs. Returned itself where
-                there are no motions.
-            rows: Whether the rows are widened too.
+            matrix: Matrix over the dofs, returned itself if there are no motions.
+            rows: Whether to extend the rows too, not the columns alone.
         """
         if self.n_motions == 0:
             return matrix
         pointers, columns, values = matrix.getValuesCSR()
         if rows:
-            added = self.n_local - self.n_dofs
-            more = np.arange(added, dtype=columns.dtype)
-            pointers = np.append(pointers, pointers[-1] + 1 + more)
-            columns = np.append(columns, self.first_motion + more)
-            values = np.append(values, np.zeros(added))
+            n_added = self.n_local - self.n_dofs
+            diagonal = np.arange(n_added, dtype=columns.dtype)
+            pointers = np.append(pointers, pointers[-1] + 1 + diagonal)
+            columns = np.append(columns, self.first_motion + diagonal)
+            values = np.append(values, np.zeros(n_added))
         return sparse_matrix(self.comm, self.n_local, pointers, columns, values)
 
 
 class DofSubset(Unknowns):
-    """Some of the dofs and all of the motions, all of them on the first rank.
-
-    The constructor is collective.
+    """The retained dofs and all motions, all on the first rank. The constructor is collective.
 
     Args:
         whole: All unknowns.
-        retained: Numbers of the dofs and motions among this rank's, ascending.
+        retained: Numbers of the retained unknowns among those of this rank, ascending.
 
-    Attributes are those of `Unknowns`, and
-        numbers: Of these unknowns among all of all ranks, ascending; the same on every rank.
+    Attributes are those of `Unknowns`, and numbers: Global numbers of the retained unknowns,
+    ascending, on every rank.
     """
 
     def __init__(self, whole: Unknowns, retained: npt.NDArray[np.int32]) -> None:
         self.whole, self.retained, self.comm = whole, retained, whole.comm
-        shares = self.comm.allgather(whole.first + retained.astype(np.int64))
-        self._counts = [share.size for share in shares]
-        self.numbers: npt.NDArray[np.int64] = np.concatenate(shares)
+        parts = self.comm.allgather(whole.first + retained.astype(np.int64))
+        self._counts = [part.size for part in parts]
+        self.numbers: npt.NDArray[np.int64] = np.concatenate(parts)
         self.first = 0
         self.n_motions, self.motions_on = whole.n_motions, 0
         self.has_motions_here = self.n_motions > 0 and self.comm.rank == 0
         self.n_global = self.numbers.size
         self.first_motion = self.n_global - self.n_motions
-        here = self.comm.rank == 0
-        self.n_local = self.n_global if here else 0
-        self.n_dofs = self.first_motion if here else 0
+        is_first = self.comm.rank == 0
+        self.n_local = self.n_global if is_first else 0
+        self.n_dofs = self.first_motion if is_first else 0
 
-    def gathered(self, values: Array) -> Array:
-        """See `Unknowns.gathered`: on the first rank, (n_local,)."""
+    def gather(self, values: Array) -> Array:
+        """Gather values at the retained unknowns on the first rank, (n_local,). Collective."""
         if self.comm.size == 1:
             return values
         result = np.zeros(self.n_local)
         self.comm.Gatherv(np.ascontiguousarray(values, dtype=np.float64), (result, self._counts))
         return result
 
-    def scattered(self, values: Array) -> Array:
-        """See `Unknowns.scattered`: to the ranks whose they are."""
+    def scatter(self, values: Array) -> Array:
+        """Scatter values from the first rank to the owners. Collective."""
         if self.comm.size == 1:
             return values
         result = np.zeros(self.retained.size)
         self.comm.Scatterv((np.ascontiguousarray(values, dtype=np.float64), self._counts), result)
         return result
 
-    def has(self, numbers: Index) -> Mask:
-        """Which of all unknowns, by their global numbers, are among these."""
-        return self._found(numbers)[1]
+    def contains(self, numbers: Index) -> Mask:
+        """Return the mask of the global numbers that are retained."""
+        return self._find(numbers)[1]
 
-    def _found(self, numbers: Index) -> tuple[Index, Mask]:
-        """Their places among these, and whether they are there."""
+    def _find(self, numbers: Index) -> tuple[Index, Mask]:
+        """Return positions among the retained unknowns and a mask of those that exist."""
         position = np.searchsorted(self.numbers, numbers)
         position[position == self.n_global] = 0
         return position, self.numbers[position] == numbers
 
-    def widened(self, matrix: PETSc.Mat, *, rows: bool = False) -> PETSc.Mat:
-        """Of a matrix over the dofs the columns selected; zero at the motions; a new matrix.
-
-        Collective.
+    def widen(self, matrix: PETSc.Mat, *, rows: bool = False) -> PETSc.Mat:
+        """Select the columns of the retained dofs, with zeros at the motions. Collective.
 
         Raises:
             NotImplementedError: With ``rows``.
@@ -158,6 +152,8 @@ class DofSubset(Unknowns):
         if rows:
             raise NotImplementedError("rows of a selection")
         pointers, columns, values = matrix.getValuesCSR()
-        position, found = self._found(columns)
-        pointers = np.concatenate([[0], np.cumsum(found)])[pointers]
-        return sparse_matrix(self.comm, self.n_local, pointers, position[found], values[found])
+        position, is_retained = self._find(columns)
+        pointers = np.concatenate([[0], np.cumsum(is_retained)])[pointers]
+        return sparse_matrix(
+            self.comm, self.n_local, pointers, position[is_retained], values[is_retained]
+        )
