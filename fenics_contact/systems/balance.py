@@ -108,7 +108,7 @@ class Parts:
         label: Body or free obstacle of every unknown of this rank, (n_local,).
         bodies: Names of bodies, then of free obstacles.
         contacts: Names of the contacts.
-        touched: Unknowns of this rank that each contact couples.
+        coupled: Unknowns of this rank that each contact couples.
         pairs: Bodies and obstacles in contact with each other, for every contact, (n_pairs, 2); a
             body on a rigid obstacle is paired with itself.
         scales: Reference scales of the bodies.
@@ -119,7 +119,7 @@ class Parts:
     label: Labels
     bodies: Sequence[str]
     contacts: Sequence[str]
-    touched: Sequence[npt.NDArray[np.int32]]
+    coupled: Sequence[npt.NDArray[np.int32]]
     pairs: Sequence[Index]
     scales: ReferenceScales
     motions: Sequence[int]
@@ -154,10 +154,10 @@ class Parts:
         reaction = residual - free
         total = contacts[0] if len(contacts) == 1 else sum(contacts, np.zeros_like(residual))
         rows = [(v, self.label) for v in (free, reaction, total, load, product)]
-        for force, touched in zip(contacts, self.touched, strict=True):
-            bodies = self.label[touched]
-            nodal = np.where(constrained, 0.0, force)[touched]
-            rows += [(free[touched], bodies), (nodal, bodies)]
+        for force, coupled in zip(contacts, self.coupled, strict=True):
+            bodies = self.label[coupled]
+            nodal = np.where(constrained, 0.0, force)[coupled]
+            rows += [(free[coupled], bodies), (nodal, bodies)]
         norms = _compute_norms(self.comm, rows, n)
         residuals, reactions, resultants, loads, terms = norms[:5]
         loads, terms = np.hypot(loads, outside[0]), np.hypot(terms, outside[1])

@@ -104,7 +104,7 @@ class Bulk:
         self._volumes = None if self.linear else _Volumes(displacement)
         kinds = dict.fromkeys(integral.integral_type() for integral in form.integrals())
         parts = (_Part(form, kind, u) for kind in kinds)
-        self._parts = [part for part in parts if not part.empty]
+        self._parts = [part for part in parts if not part.is_empty]
         self._compiled_tangent = compile_by_rule(self.tangent_form)
         self._pattern = (
             self._compiled_tangent[0]
@@ -304,8 +304,7 @@ class Bulk:
     def _measure_unit(self, dofs: Indices) -> float:
         """Return the unit of a field that makes its coupling to displacements `scale`. Collective.
 
-        A field that is coupled to others only, or by round-off, has its own diagonal block for
-        that.
+        A field coupled only to other fields, or by round-off, is scaled by its diagonal block.
         """
         mask = np.zeros(self._n_owned)
         mask[dofs[dofs < self._n_owned]] = 1.0
@@ -399,9 +398,11 @@ class _Part:
 
     def __init__(self, form: ufl.Form, kind: str, u: fem.Function) -> None:
         integrals = ufl.Form([i for i in form.integrals() if i.integral_type() == kind])
-        self.empty = ufl.algorithms.expand_derivatives(integrals).empty()  # a load that is 0 in UFL
+        self.is_empty = ufl.algorithms.expand_derivatives(
+            integrals
+        ).empty()  # a load that is 0 in UFL
         at_zero = ufl.replace(integrals, {u: ufl.zero(u.ufl_shape)})
-        self._vanishes = ufl.algorithms.expand_derivatives(at_zero).empty()
+        self._is_zero = ufl.algorithms.expand_derivatives(at_zero).empty()
         self._compiled = compile_by_rule(integrals)
         self._u = u
         others = [c for c in integrals.coefficients() if c is not u]
@@ -415,7 +416,7 @@ class _Part:
 
     def assemble_at_zero(self) -> Array:
         """Return the values at u = 0, without summing up ghosts, cached."""
-        if self._vanishes:
+        if self._is_zero:
             return self._at_zero
         if self._dependence.changed:
             self._dependence.forget()  # until the assembly is complete

@@ -25,7 +25,7 @@ def find_ejected_bodies(
     full: FullSystem,
     motions: RigidBodyModes,
     contacts: Sequence[Array],
-    began: Array,
+    initial: Array,
     start: InitialForces,
 ) -> dict[str, tuple[float, float, float]]:
     """Find unloaded bodies displaced further than anything can have moved them. Collective.
@@ -39,7 +39,7 @@ def find_ejected_bodies(
         full: The system at its present state.
         motions: Rigid-body modes of the bodies.
         contacts: Forces of each contact at this rank's unknowns.
-        began: State at the start of the increment.
+        initial: State at the start of the increment.
         start: Forces at that state.
 
     Returns:
@@ -57,7 +57,7 @@ def find_ejected_bodies(
     unloaded = unconstrained & negligible
     if not unloaded.any():
         return {}
-    change = full.state() - began
+    change = full.state() - initial
     translations, counts = (motions.by_body(full, each) for each in (change, np.ones_like(change)))
     sums = np.column_stack([translations[:, : full.gdim], counts[:, 0]])
     sums = global_sum(full.unknowns.comm, sums)
@@ -76,7 +76,7 @@ def find_ejected_bodies(
     distance, minimum = np.linalg.norm(translation, axis=1), FLAT * scales.size
     if not np.any(unloaded & (distance > np.maximum(_EJECTION_RATIO * nearby, minimum))):
         return {}
-    nearby = np.maximum(nearby, _measure_expulsion(full, motions, unloaded, began))
+    nearby = np.maximum(nearby, _measure_expulsion(full, motions, unloaded, initial))
     limit = np.maximum(_EJECTION_RATIO * nearby, minimum)
     rows = np.stack([distance, limit, nearby], axis=1).tolist()
     ejected = np.flatnonzero(unloaded & (distance > limit))
@@ -84,18 +84,18 @@ def find_ejected_bodies(
 
 
 def _measure_expulsion(
-    full: FullSystem, motions: RigidBodyModes, bodies: Mask, began: Array
+    full: FullSystem, motions: RigidBodyModes, bodies: Mask, initial: Array
 ) -> Array:
     """Return the least motion of bodies in a mask without penetration. Collective.
 
     It starts at the state at the start of the increment; the result is (n_bodies,) (length).
     """
     zero: Array = np.zeros(len(motions.free))
-    modes = np.eye(len(zero))[motions.of_bodies_alone(bodies)]
+    modes = np.eye(len(zero))[motions.find_modes_of_bodies(bodies)]
     if not len(modes):
         return motions.size_by_body(zero)
     present = full.state()
-    rigid = motions.fit(present - began, np.asarray) @ modes.T @ modes
+    rigid = motions.fit(present - initial, np.asarray) @ modes.T @ modes
     correction = motions.displacement(-rigid)
     full.set_state(present + np.where(full.constrained, 0.0, correction))
     # Within an iteration the stored values may belong to another state.

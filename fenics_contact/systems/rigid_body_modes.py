@@ -91,7 +91,7 @@ class RigidBodyModes(RigidMotions):
         bodies, _ = self._moved_parts()
         return np.asarray(bodies.any(axis=1))
 
-    def of_bodies_alone(self, bodies: Mask) -> Index:
+    def find_modes_of_bodies(self, bodies: Mask) -> Index:
         """Return the numbers of the free motions that move only chosen bodies."""
         moves, obstacles = self._moved_parts()
         return np.flatnonzero(
@@ -245,7 +245,7 @@ class RigidBodyModes(RigidMotions):
     def has_force(self, number: int, contact: Contact, values: PointValues) -> Mask:
         """Return where normal forces and friction exceed round-off, (2, n_points). Collective.
 
-        The friction force is the friction bound. A law with tension acts at all paired points.
+        Friction counts with at least its bound. A law with tension acts at all paired points.
         """
         friction = np.maximum(np.linalg.norm(values.traction, axis=1), values.friction_bound)
         forces = contact.measure * np.array([np.abs(values.normal_traction), friction])

@@ -79,15 +79,15 @@ class Substructure:
 
     def _schur_complement(self) -> Array:
         n = self._boundary.size
-        found, status, values = ctypes.c_void_p(), ctypes.c_int(), ctypes.POINTER(ctypes.c_double)()
+        schur, status, values = ctypes.c_void_p(), ctypes.c_int(), ctypes.POINTER(ctypes.c_double)()
         factor = _handle(self._factor)
         _call_petsc(
-            "MatFactorCreateSchurComplement", factor, ctypes.byref(found), ctypes.byref(status)
+            "MatFactorCreateSchurComplement", factor, ctypes.byref(schur), ctypes.byref(status)
         )
-        _call_petsc("MatDenseGetArrayRead", found, ctypes.byref(values))
+        _call_petsc("MatDenseGetArrayRead", schur, ctypes.byref(values))
         array = np.ctypeslib.as_array(values, (n, n)).T.copy(order="F")
-        _call_petsc("MatDenseRestoreArrayRead", found, ctypes.byref(values))
-        _call_petsc("MatDestroy", ctypes.byref(found))
+        _call_petsc("MatDenseRestoreArrayRead", schur, ctypes.byref(values))
+        _call_petsc("MatDestroy", ctypes.byref(schur))
         return array
 
     def release(self) -> Array:

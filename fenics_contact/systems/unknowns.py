@@ -99,8 +99,8 @@ class DofSubset(Unknowns):
         whole: All unknowns.
         retained: Numbers of the retained unknowns among those of this rank, ascending.
 
-    Attributes are those of `Unknowns`, and numbers: Global numbers of the retained unknowns,
-    ascending, on every rank.
+    Attributes (besides those of `Unknowns`):
+        numbers: Global numbers of the retained unknowns, ascending, on every rank.
     """
 
     def __init__(self, whole: Unknowns, retained: npt.NDArray[np.int32]) -> None:
