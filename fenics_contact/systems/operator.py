@@ -233,7 +233,7 @@ class ContactOperator:
     # ---- an obstacle that is rotated by a moment -------------------------------------------------
 
     def _arms(self) -> Array:
-        """Return ω × r / L, minus the derivative of the jump by the angle's unknown. Collective.
+        """Return ω × r / L, minus the derivative of the jump by the angle times L. Collective.
 
         Returns:
             Array (n_points, gdim); zero where a point is not within.

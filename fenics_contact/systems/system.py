@@ -248,7 +248,7 @@ class System(ABC):
             motion.set_value(value)
 
     def is_twisted(self) -> bool:
-        """Return whether a free obstacle has rotated by more than a right angle.
+        """Return whether a free obstacle has rotated by a right angle or more in the increment.
 
         Solutions are not unique beyond: after a full turn its points are at the same positions.
         """
