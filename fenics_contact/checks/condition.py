@@ -12,10 +12,10 @@ class Condition:
     """An error and its limit.
 
     Attributes:
-        name: Of what, in a word or two.
+        name: What is verified, in a few words.
         value: The error.
-        limit: The largest one accepted, in the same unit.
-        failure: What to say if it is larger.
+        limit: Largest error accepted, in the same unit.
+        failure: Error text if the limit is exceeded.
     """
 
     name: str
@@ -25,5 +25,5 @@ class Condition:
 
     @property
     def holds(self) -> bool:
-        """Whether the error is a number that is not above the limit."""
+        """Whether the error is at most the limit; a NaN is not."""
         return bool(self.value <= self.limit)

@@ -18,58 +18,57 @@ from fenics_contact.types import Array
 __all__ = ["CrossCheck"]
 
 
-# Round-off of displacements that two routes add up in different orders, by their size.
-_ROUND_OFF = 100 * np.finfo(float).eps
+# Round-off of displacements summed in different orders, relative to their magnitude.
+_SUMMATION_ROUND_OFF_RATIO = 100 * np.finfo(float).eps
 
 
 class CrossCheck:
-    """Compares the forces of contacts by two routes."""
+    """Compares nodal contact forces: sums over the points, and DOLFINx's assembly."""
 
     def __init__(self, contacts: Sequence[Contact]) -> None:
         self._contacts = contacts
         self._forms: dict[str, Any] = {}
 
     def compare(self) -> dict[str, ForceBalance]:
-        """Nodal forces on Γc as the solver has them against those of the boundary form. Collective.
+        """Compare the nodal forces of the solver with the assembled ones, by contact. Collective.
 
-        Both have the round-off of the displacement, by as much as the springs are stiff.
+        The tolerance includes the round-off of the displacement times the contact stiffness.
         """
-        found = {}
+        balances = {}
         for contact in self._contacts:
             comm, values = contact.surface.mesh.comm, contact.values
-            mine, other = self._forces(contact)
-            across = np.linalg.norm(values.tangential_stiffness, axis=(1, 2))
-            stiffness = values.normal_stiffness + across
-            terms = contact.moved() + np.abs(values.initial_gap)
-            blur = float(global_sum(comm, contact.measure @ (stiffness * terms)))
+            by_points, by_form = self._forces(contact)
+            tangential = np.linalg.norm(values.tangential_stiffness, axis=(1, 2))
+            stiffness = values.normal_stiffness + tangential
+            magnitude = contact.moved() + np.abs(values.initial_gap)
+            sensitivity = float(global_sum(comm, contact.measure @ (stiffness * magnitude)))
             d = values.x.shape[1]
-            sizes = (longest(comm, f.reshape(-1, d)) for f in (mine - other, mine))
+            sizes = (longest(comm, f.reshape(-1, d)) for f in (by_points - by_form, by_points))
             residual, force = (float(size) for size in sizes)
-            allowed = 1e-10 * force + _ROUND_OFF * blur
-            found[contact.name] = ForceBalance(residual, force, allowed)
-        return found
+            allowed = 1e-10 * force + _SUMMATION_ROUND_OFF_RATIO * sensitivity
+            balances[contact.name] = ForceBalance(residual, force, allowed)
+        return balances
 
     def _forces(self, contact: Contact) -> tuple[Array, Array]:
-        """Nodal forces on the body with Γc at the present ``u``. Collective.
+        """Return the nodal forces on the body with Γc at the present ``u``. Collective.
 
         Returns:
-            (n_owned_dofs,) each (force): as `ContactOperator.add_force` has them, by sums over the
-            points; and as DOLFINx assembles the boundary form (46, 55), in which ``u`` itself
-            stands where the obstacle is rigid and no motion of it is unknown, and the jump at the
-            points otherwise.
+            Two arrays (n_owned_dofs,) (force): sums over the points, as in
+            `ContactOperator.add_force`; and the boundary form (46, 55) assembled by DOLFINx, with
+            ``u`` itself if the obstacle is rigid and has no unknown motion, else with the jump.
         """
-        opposite = contact.contact_kinematics
-        opposite.update()
-        vector, forces = opposite.pairs.own_map.createVecs()
+        kinematics = contact.contact_kinematics
+        kinematics.update()
+        vector, forces = kinematics.pairs.own_map.createVecs()
         traction = contact.effective_law.own.evaluate_traction()
         forces.array[:] = (contact.area[:, None] * traction).ravel()
-        opposite.pairs.own_map.multTranspose(forces, vector)
+        kinematics.pairs.own_map.multTranspose(forces, vector)
         by_points = vector.array_r.copy()
         for item in (vector, forces):
             item.destroy()
         if contact.name not in self._forms:
             displacement = (
-                contact.u if contact.rigid and not contact.motions else opposite.local_jump
+                contact.u if contact.rigid and not contact.motions else kinematics.local_jump
             )
             form = contact.form_at(displacement, ufl.TestFunction(contact.u.function_space))
             self._forms[contact.name] = compile_form(-form, contact.entity_maps)

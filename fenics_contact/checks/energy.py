@@ -17,8 +17,8 @@ from fenics_contact.types import Array, Index
 __all__ = ["Energy", "EnergyState"]
 
 
-# Work, as a share of the energies that there are, that is within the solver's tolerance.
-_NOTHING = 1e-8
+# Work of friction within the solver's tolerance, relative to the energies of the group of bodies.
+_NEGLIGIBLE_WORK_RATIO = 1e-8
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class EnergyState:
     """Forces and displacements of a state on this rank; two states determine an `Energy`.
 
     Attributes:
-        forces: Forces at the unknowns, by the coordinate_id of their coordinates.
+        forces: Forces at the unknowns, by `System.coordinate_id`.
         contacts: For each contact, tractions on the body, displacement relative to the obstacle,
             and prescribed displacement of the obstacle, (3, n_points, gdim). If the obstacle
             rotates: tractions, displacement relative to the obstacle in its frame, displacement of
@@ -83,76 +83,74 @@ class EnergyState:
     def unloaded(cls, forces: dict[Any, Forces], contacts: Sequence[Contact]) -> EnergyState:
         """Return the state of contacts without tractions."""
         springs: list[Array] = [np.zeros(len(c.points)) for c in contacts]
-        return cls(forces, [_ways(c, 0 * c.points) for c in contacts], springs)
+        return cls(forces, [_contact_rows(c, 0 * c.points) for c in contacts], springs)
 
     @classmethod
     def at(cls, forces: dict[Any, Forces], contacts: Sequence[Contact]) -> EnergyState:
         """Return the evaluated state of contacts."""
         springs = [np.asarray(c.measure * c.values.stored) for c in contacts]
-        return cls(forces, [_ways(c, c.traction) for c in contacts], springs)
+        return cls(forces, [_contact_rows(c, c.traction) for c in contacts], springs)
 
     def with_forces(self, coordinate_id: Any, forces: Forces) -> EnergyState:
-        """Return this state with the forces in other coordinates, too."""
+        """Return this state with the forces in additional coordinates."""
         return dataclasses.replace(self, forces={**self.forces, coordinate_id: forces})
 
     def between(self, contacts: Sequence[Contact]) -> EnergyState:
-        """Return this state, the committed one, with relative displacements of the new pairs."""
-        ways = [
-            np.stack([way[0], contact.contact_kinematics.committed_jump, *way[2:]])
-            for way, contact in zip(self.contacts, contacts, strict=True)
+        """Return this committed state with the committed jumps of the contacts' present pairs."""
+        rows = [
+            np.stack([row[0], contact.contact_kinematics.committed_jump, *row[2:]])
+            for row, contact in zip(self.contacts, contacts, strict=True)
         ]
-        return dataclasses.replace(self, contacts=ways)
+        return dataclasses.replace(self, contacts=rows)
 
     def since(
         self, before: EnergyState, contacts: Sequence[Contact], scales: ReferenceScales
     ) -> Energy:
         """Return the energies between the state ``before`` and this one. Collective."""
-        coordinate_id = next(
-            coordinate_id for coordinate_id in self.forces if coordinate_id in before.forces
-        )
-        old, new = before.forces[coordinate_id], self.forces[coordinate_id]
-        way = new.unknowns - old.unknowns
+        shared_id = next(coordinates for coordinates in self.forces if coordinates in before.forces)
+        old, new = before.forces[shared_id], self.forces[shared_id]
+        displacement = new.unknowns - old.unknowns
         groups = scales.group[new.label]
-        # Work, elastic, springs, dissipation, work of the tractions, that of friction, its size,
-        # and the level of all: by group.
+        # By group: work, elastic, springs, dissipation, work of the tractions, work of friction,
+        # bound of the work of friction, magnitude of the energies.
         sums: Array = np.zeros((8, scales.n_groups))
 
         def add(row: int, values: Array, groups: Index) -> None:
             sums[row] += np.bincount(groups, values, minlength=scales.n_groups)
 
         add(7, np.abs(new.internal * new.unknowns), groups)
-        add(0, 0.5 * (old.external + new.external) * way, groups)
-        add(1, 0.5 * (old.internal + new.internal) * way, groups)
+        add(0, 0.5 * (old.external + new.external) * displacement, groups)
+        add(1, 0.5 * (old.internal + new.internal) * displacement, groups)
         states = zip(
             contacts, before.contacts, self.contacts, before.springs, self.springs, strict=True
         )
-        for number, (contact, there, here, had, has) in enumerate(states):
+        for number, (contact, start, end, springs_start, springs_end) in enumerate(states):
             groups = scales.group_of_points(number)
-            add(7, has, groups)
-            add(2, has - had, groups)
-            mean = contact.measure[:, None] * 0.5 * (there[0] + here[0])
-            relative, carried = here[1] - there[1], here[2] - there[2]
+            add(7, springs_end, groups)
+            add(2, springs_end - springs_start, groups)
+            mean = contact.measure[:, None] * 0.5 * (start[0] + end[0])
+            relative, obstacle = end[1] - start[1], end[2] - start[2]
             if contact.contact_kinematics.turns:
-                # Half-way between both ends, else a normal pressure works on what turns beneath it.
-                d = here.shape[2]
-                axes = 0.5 * (there[3 : 3 + d] + here[3 : 3 + d])
+                # With the mean of the axes, normal pressure does no work on a rotating obstacle.
+                d = end.shape[2]
+                axes = 0.5 * (start[3 : 3 + d] + end[3 : 3 + d])
                 relative = np.einsum("jqi,qj->qi", axes, relative)
-                carried = carried - relative
+                obstacle = obstacle - relative
                 if contact.free_angle is not None:
-                    # The work of the moment is that of the loads, too.
-                    turned = here[-1] - there[-1]
-                    moments = 0.5 * (there[0] * there[-2] + here[0] * here[-2])
-                    add(0, -contact.measure * np.sum(moments * turned, axis=1), groups)
-            add(0, _dot(mean, carried), groups)
+                    # The moment is one of the loads, which include its work already.
+                    rotation = end[-1] - start[-1]
+                    moments = 0.5 * (start[0] * start[-2] + end[0] * end[-2])
+                    add(0, -contact.measure * np.sum(moments * rotation, axis=1), groups)
+            add(0, _dot(mean, obstacle), groups)
             add(4, -_dot(mean, relative), groups)
             if contact.law.has_friction:
                 add(3, contact.measure * contact.values.dissipated, groups)
-                # Tractions before are those of the commit, not multipliers in their place.
+                # At the start the committed tractions, not the multipliers that replace them.
                 slip, normal = contact.slip_vector(), contact.values.normal
-                first = contact.values.carried_traction if contact.finite else there[0]
-                ends = np.stack([first, here[0]])
+                first = contact.values.carried_traction if contact.finite else start[0]
+                ends = np.stack([first, end[0]])
                 sizes = contact.measure * np.linalg.norm(ends, axis=2).max(axis=0)
-                # Forces that are round-off may have any direction.
+                # Forces below round-off may have any direction.
                 acts = sizes > scales.round_off_at_points(number, sizes)
                 weight, length = 0.5 * contact.measure * acts, np.sqrt(_dot(slip, slip))
                 for traction in ends:
@@ -160,13 +158,12 @@ class EnergyState:
                     add(5, weight * _dot(side, slip), groups)
                     add(6, weight * (np.sqrt(_dot(side, side)) * length), groups)
         sums = scales.global_sum(sums)
-        # Nothing has slipped but what the solver leaves.
-        sums[5, np.abs(sums[5]) <= _NOTHING * sums[7]] = 0.0
+        sums[5, np.abs(sums[5]) <= _NEGLIGIBLE_WORK_RATIO * sums[7]] = 0.0
         work, elastic, springs, dissipation, tractions, friction, sliding, _ = map(
             float, sums.sum(axis=1)
         )
         exchanged = np.maximum(np.abs(sums[:3]).sum(axis=0), sums[6])
-        gives = sums[5] > 0
+        gains = sums[5] > 0
         return Energy(
             work=work,
             elastic=elastic,
@@ -176,28 +173,28 @@ class EnergyState:
             friction=friction,
             sliding=sliding,
             imbalance=work - elastic - tractions,
-            friction_energy_gain=float((sums[5, gives] / exchanged[gives]).max(initial=0.0)),
+            friction_energy_gain=float((sums[5, gains] / exchanged[gains]).max(initial=0.0)),
         )
 
 
-def _ways(contact: Contact, traction: Array) -> Array:
-    """A contact's part of `EnergyState.contacts`."""
+def _contact_rows(contact: Contact, traction: Array) -> Array:
+    """Return the rows of `EnergyState.contacts` of one contact."""
     jump = contact.values.jump
     if not contact.contact_kinematics.turns:
         return np.stack([traction, jump, contact.values.shift])
     units = np.eye(jump.shape[1])
     axes = [contact.contact_kinematics.turned(np.broadcast_to(unit, jump.shape)) for unit in units]
-    # The work of forces that move the obstacle is that of the loads.
+    # Forces on the obstacle are loads, which include their work already.
     own = contact.own_displacement()
     for component, motion in contact.free_motion.items():
         own[:, component] -= float(motion.value)
-    ways = [traction, jump, own, *axes]
+    rows = [traction, jump, own, *axes]
     if contact.free_angle is not None:
         angle = float(contact.free_angle.value)
-        ways += [contact.contact_kinematics.turning_rate(), np.full_like(jump, angle)]
-    return np.stack(ways)
+        rows += [contact.contact_kinematics.turning_rate(), np.full_like(jump, angle)]
+    return np.stack(rows)
 
 
 def _dot(one: Array, other: Array) -> Array:
-    """Products of vectors at points, (n_points,)."""
+    """Return the scalar products of vectors at the points, (n_points,)."""
     return np.asarray(np.einsum("qi,qi->q", one, other), dtype=np.float64)
