@@ -10,7 +10,7 @@ from enum import Enum
 import numpy as np
 
 from fenics_contact.checks.energy import Energy, EnergyState
-from fenics_contact.checks.input_validation import check_values
+from fenics_contact.checks.input_validation import check_prescribed_values
 from fenics_contact.checks.verdict import Verdict
 from fenics_contact.checks.verifier import Verifier
 from fenics_contact.contact.contact import Contact
@@ -101,7 +101,7 @@ class IncrementSolver:
                 "loads, and the denominators in F (λ = E ν/((1 + ν)(1 - 2ν)) is infinite at "
                 "ν = 0.5)"
             )
-        check_values(self.full.bcs, self.full.displacement.whole)
+        check_prescribed_values(self.full.bcs, self.full.displacement.whole)
         if self.full.bulk.has_new_data():
             find_free_modes(self.solver.equations.motions, self.full)
         if balance and self.full.bulk.linear:

@@ -16,8 +16,8 @@ from fenics_contact.arguments import check_bool, is_number, listed
 from fenics_contact.checks.energy import EnergyState
 from fenics_contact.checks.input_validation import (
     check_contacts,
-    check_start,
-    constrained_unknowns,
+    check_undeformed_geometry,
+    find_constrained_unknowns,
     find_displacement,
 )
 from fenics_contact.checks.verdict import Verdict
@@ -170,7 +170,7 @@ class ContactProblem:
         self._prefix, self._comm = prefix, u.function_space.mesh.comm
         n_motions = sum(len(contact.motions) for contact in self.contacts)
         unknowns = Unknowns(u.function_space, n_motions)
-        constrained = constrained_unknowns(bcs, u, unknowns, mixed=self.displacement.mixed)
+        constrained = find_constrained_unknowns(bcs, u, unknowns, mixed=self.displacement.mixed)
         check_contacts(self.contacts, self.displacement, constrained)
         self.full = FullSystem(self.displacement, unknowns, bulk, self.contacts, constrained, bcs)
 
@@ -179,7 +179,7 @@ class ContactProblem:
         bulk.check_elastic()
         modulus = TrackedModulus(bulk, self.displacement, self.contacts)
         self.motions = RigidBodyModes(self.full)
-        self.initial_penetration = check_start(self.contacts)
+        self.initial_penetration = check_undeformed_geometry(self.contacts)
         find_free_modes(self.motions, self.full)
         self.full.scales.begin(self.full.operators)
         judge = Verifier(self.full, self.motions, tolerance=tolerance, cross_check=cross_check)

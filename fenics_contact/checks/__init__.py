@@ -1,1 +1,1 @@
-"""What is looked at before, while and after an increment is solved."""
+"""Validation of the input and verification of every solution."""

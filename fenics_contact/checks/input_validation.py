@@ -25,30 +25,31 @@ from fenics_contact.wording import place_in_words
 
 __all__ = [
     "check_contacts",
-    "check_start",
-    "check_values",
-    "constrained_unknowns",
+    "check_prescribed_values",
+    "check_undeformed_geometry",
+    "find_constrained_unknowns",
     "find_displacement",
 ]
 
 
 logger = logging.getLogger("fenics_contact")
 
-# Largest round-off of coordinates, relative to the facets of Γc.
-_COORDINATE_ROUND_OFF = 2e-7
-# How parts of a mixed function are prescribed.
-_OF_A_PART = (
+# Largest round-off of coordinates, relative to the smallest facet of Γc.
+_MAX_COORDINATE_ROUND_OFF_RATIO = 2e-7
+_ADVICE_FOR_MIXED_FUNCTION = (
     "; for a part of a mixed function use dirichletbc(value, dofs, W.sub(0)), where dofs = "
     "locate_dofs_topological((W.sub(0), V), ...) and V, _ = W.sub(0).collapse()"
 )
-_OF_U = "; use V = u.function_space, or V.sub(i) for a component: dirichletbc(value, dofs, V)"
+_ADVICE_FOR_DISPLACEMENT = (
+    "; use V = u.function_space, or V.sub(i) for a component: dirichletbc(value, dofs, V)"
+)
 
 
 def find_displacement(u: fem.Function, contacts: Sequence[Contact]) -> Displacement:
-    """That of the contacts, which must be of ``u`` and the same for all. Collective.
+    """Return the displacement of the contacts. Collective.
 
     Raises:
-        ValueError: It is not.
+        ValueError: The contacts differ in their displacements, or have another function than ``u``.
     """
     if isinstance(u, ufl.Form):
         raise ValueError("u is a Form; the arguments are ContactProblem(F, u): residual, function")
@@ -58,10 +59,10 @@ def find_displacement(u: fem.Function, contacts: Sequence[Contact]) -> Displacem
             "that is solved for, the w of ufl.split(w)"
         )
     for contact in contacts:
-        found, first = contact.displacement, contacts[0].displacement
-        if found.whole is not u:
+        displacement, first = contact.displacement, contacts[0].displacement
+        if displacement.whole is not u:
             raise ValueError(f"{contact.name}: its u is not the u of the problem; use the same")
-        if not found.same_part(first):
+        if not displacement.same_part(first):
             raise ValueError(
                 f"{contact.name}: its u is another part of the mixed function than that of "
                 f"{contacts[0].name}; all contacts must have the same displacement"
@@ -69,29 +70,28 @@ def find_displacement(u: fem.Function, contacts: Sequence[Contact]) -> Displacem
     if contacts:
         return contacts[0].displacement
     if not isinstance(u, fem.Function):
-        return Displacement(u, None, "problem")  # refuses it
+        return Displacement(u, None, "problem")  # raises the error
     return Displacement.only(u, "problem")
 
 
-def constrained_unknowns(
+def find_constrained_unknowns(
     bcs: Sequence[fem.DirichletBC], u: fem.Function, unknowns: Unknowns, *, mixed: bool
 ) -> Mask:
-    """This rank's unknowns with Dirichlet conditions, (n_local,). Collective.
-
-    The displacement may be a part of a mixed function ``u``.
+    """Return this rank's mask of unknowns with Dirichlet conditions, (n_local,). Collective.
 
     Raises:
-        ValueError: A condition is of another function.
+        ValueError: A condition is on another function space.
     """
     mask = np.zeros(unknowns.n_local, dtype=np.bool_)
     for number, bc in enumerate(bcs):
         dofs, _ = bc.dof_indices()
-        # A scalar space, or a collapsed part, may have as many nodes and other numbers of dofs.
-        other = not compat.contains(u.function_space, bc.function_space)
-        if unknowns.comm.allreduce(int(other or (dofs.size and dofs.max() >= u.x.array.size))):
-            advice = _OF_A_PART if mixed else _OF_U
+        other_space = not compat.contains(u.function_space, bc.function_space)
+        if unknowns.comm.allreduce(
+            int(other_space or (dofs.size and dofs.max() >= u.x.array.size))
+        ):
+            advice = _ADVICE_FOR_MIXED_FUNCTION if mixed else _ADVICE_FOR_DISPLACEMENT
             raise ValueError(f"a Dirichlet condition is on another function space than u{advice}")
-        # Their number of owned dofs, which comes with them, is wrong for blocked conditions.
+        # DOLFINx's number of owned dofs is wrong for blocked conditions.
         mask[dofs[dofs < unknowns.n_dofs]] = True
         if not unknowns.comm.allreduce(dofs.size):
             warn(
@@ -102,12 +102,8 @@ def constrained_unknowns(
     return mask
 
 
-def check_values(bcs: Sequence[fem.DirichletBC], u: fem.Function) -> None:
-    """Refuse prescribed values that are no numbers. Collective.
-
-    Raises:
-        ValueError: On all ranks.
-    """
+def check_prescribed_values(bcs: Sequence[fem.DirichletBC], u: fem.Function) -> None:
+    """Raise a ValueError on all ranks if a prescribed value is not finite. Collective."""
     comm, values = u.function_space.mesh.comm, np.zeros_like(u.x.array)
     for number, bc in enumerate(bcs):
         bc.set(values)
@@ -120,10 +116,11 @@ def check_values(bcs: Sequence[fem.DirichletBC], u: fem.Function) -> None:
 def check_contacts(
     contacts: Sequence[Contact], displacement: Displacement, constrained: Mask
 ) -> None:
-    """Refuse contacts of one name or one free motion, and Γc where all is prescribed. Collective.
+    """Check names, motions and free dofs of the contacts. Collective.
 
     Raises:
-        ValueError: On all ranks.
+        ValueError: Contacts share a name or an unknown motion, or all dofs of a facet of Γc are
+            prescribed; raised on all ranks.
     """
     names = [c.name for c in contacts]
     if len(set(names)) != len(names):
@@ -131,69 +128,71 @@ def check_contacts(
     for one, other in combinations(contacts, 2):
         _check_shared(one, other)
     space = displacement.whole.function_space
-    held = fem.Function(space)
+    prescribed = fem.Function(space)
     n_owned = space.dofmap.index_map.size_local * space.dofmap.index_map_bs
-    held.x.array[:n_owned] = constrained[:n_owned]
-    held.x.scatter_forward()
-    mask = held.x.array if displacement.dofs is None else held.x.array[displacement.dofs]
+    prescribed.x.array[:n_owned] = constrained[:n_owned]
+    prescribed.x.scatter_forward()
+    values = prescribed.x.array
+    mask = values if displacement.dofs is None else values[displacement.dofs]
     for contact in contacts:
-        n_held = space.mesh.comm.allreduce(_facets_held(contact, mask))
-        if n_held:
+        n_facets = space.mesh.comm.allreduce(_count_constrained_facets(contact, mask))
+        if n_facets:
             raise ValueError(
-                f"{contact.name}: all displacements of {n_held} facets of Γc are prescribed by "
+                f"{contact.name}: all displacements of {n_facets} facets of Γc are prescribed by "
                 "Dirichlet conditions, so that contact has no unknowns there; remove these facets "
                 "from Γc or from the condition"
             )
 
 
 def _check_shared(one: Contact, other: Contact) -> None:
-    """Refuse one force or moment for the obstacles of two contacts, which move each on its own."""
-    moved = one.obstacle.displacement, other.obstacle.displacement
-    turned = one.obstacle.rotation, other.obstacle.rotation
-    for free, (mine, theirs), what in (
-        (bool(one.free_motion), moved, "the same Motion, whose force"),
-        (one.free_angle is not None, turned, "the same Rotation, whose moment"),
+    """Raise a ValueError if two contacts share the force or moment on their obstacles."""
+    displacements = one.obstacle.displacement, other.obstacle.displacement
+    rotations = one.obstacle.rotation, other.obstacle.rotation
+    for is_free, (first, second), load in (
+        (bool(one.free_motion), displacements, "the same Motion, whose force"),
+        (one.free_angle is not None, rotations, "the same Rotation, whose moment"),
     ):
-        if free and mine is theirs:
+        if is_free and first is second:
             raise ValueError(
-                f"{one.name} and {other.name} have {what} would act twice, on two independent "
+                f"{one.name} and {other.name} have {load} would act twice, on two independent "
                 "obstacles; for one obstacle use one Contact, on "
                 "ContactSurface(mesh, tags, [1, 2]), otherwise give each its own"
             )
 
 
-def _facets_held(contact: Contact, constrained: Array) -> int:
-    """Number of this rank's facets of Γc all of whose displacements are prescribed."""
+def _count_constrained_facets(contact: Contact, constrained: Array) -> int:
+    """Return the number of this rank's facets of Γc with all displacements prescribed."""
     space, facets = contact.u.function_space, contact.surface.facets
-    held: Mask = np.all(constrained.reshape(-1, space.dofmap.bs), axis=1)
-    return int(np.count_nonzero(held[facet_nodes(space, facets)].all(axis=1)))
+    nodes: Mask = np.all(constrained.reshape(-1, space.dofmap.bs), axis=1)
+    return int(np.count_nonzero(nodes[facet_nodes(space, facets)].all(axis=1)))
 
 
-def check_start(contacts: Sequence[Contact]) -> float:
-    """Refuse input out of range; warn of what makes forces wrong without an error. Collective.
+def check_undeformed_geometry(contacts: Sequence[Contact]) -> float:
+    """Check the undeformed geometry and the input of the contacts. Collective.
 
-    These are bodies in their obstacles, points too few for what is opposite, one obstacle twice.
+    Warns of initial penetration, of too few quadrature points, and of obstacles that two contacts
+    have in common: these make forces wrong.
 
     Returns:
-        Largest penetration of the undeformed body (length), 0 if none; an interference by a
-        prescribed gap is none.
+        Largest penetration of the undeformed body (length), without an interference prescribed by
+        ``gap``; 0 if there is none.
 
     Raises:
-        ValueError: On all ranks.
+        ValueError: Input out of range, or an obstacle inside of the body; raised on all ranks.
     """
     worst = 0.0
     for contact in contacts:
         comm = contact.surface.mesh.comm
         extent = global_max(comm, np.abs(contact.points))
         smallest = global_min(comm, contact.quadrature.facet_sizes, empty=np.inf)
-        if not extent * np.finfo(np.float64).eps <= _COORDINATE_ROUND_OFF * smallest:
+        if not extent * np.finfo(np.float64).eps <= _MAX_COORDINATE_ROUND_OFF_RATIO * smallest:
             raise ValueError(
                 f"{contact.name}: facets of Γc of size {smallest:.3g} have coordinates as large as "
                 f"{extent:.3g}, too large for double precision; translate mesh and obstacles to "
                 "the origin"
             )
         contact.check_input()
-        _refuse_enclosed(contact)
+        _check_obstacle_outside(contact)
         contact.inputs.check_side(contact.values, gap_prescribed=contact.gap_prescribed)
         gap = global_min(comm, contact.contact_kinematics.undeformed_gap(contact.values))
         if gap < -ROUND_OFF * extent and not contact.gap_prescribed:
@@ -206,58 +205,57 @@ def check_start(contacts: Sequence[Contact]) -> float:
                     -gap,
                 )
         _warn_of_few_points(contact)
-    _warn_of_doubles(contacts)
+    _warn_of_shared_obstacles(contacts)
     return worst
 
 
-def _refuse_enclosed(contact: Contact) -> None:
-    """Refuse a rigid obstacle inside of an undeformed body whose Γc all faces away. Collective.
+def _check_obstacle_outside(contact: Contact) -> None:
+    """Raise a ValueError if a rigid obstacle is inside of the undeformed body. Collective.
 
-    Raises:
-        ValueError: On all ranks.
+    Only bodies whose Γc all faces away from the obstacle are concerned.
     """
     if contact.contact_kinematics.sampler is None:
         return
     mesh, values, places = contact.surface.mesh, contact.values, contact.facet_places
     comm, facets = mesh.comm, places.facets
-    # Paths are followed from where the obstacle has not been displaced.
+
     gap, normal = contact.contact_kinematics.sampler.sample(values.x)
-    # Points of the obstacle's surface, and by round-off inside of it.
     smallest = global_min(comm, contact.quadrature.facet_sizes, empty=np.inf)
-    inside = _COORDINATE_ROUND_OFF * smallest
-    away = (values.facing < 0) & (gap > inside)
+    tolerance = _MAX_COORDINATE_ROUND_OFF_RATIO * smallest
+    away = (values.facing < 0) & (gap > tolerance)
     if not comm.allreduce(int(away.any())):
         return
-    n_bodies, of_node = connected_bodies(facets.space)
+    n_bodies, body_of_node = connected_bodies(facets.space)
     nodes = facets.space.dofmap.list
     body = np.empty(len(values.x), dtype=np.int64)
-    body[places.rows] = of_node[nodes[facets.cells, 0]][:, None]
+    body[places.rows] = body_of_node[nodes[facets.cells, 0]][:, None]
     facing = np.full(n_bodies, -np.inf)
     np.maximum.at(facing, body, values.facing)
     comm.Allreduce(MPI.IN_PLACE, facing, op=MPI.MAX)
     away &= facing[body] < 0
-    feet = values.x + (gap + inside)[:, None] * normal
-    of_foot, feet = np.concatenate(comm.allgather(body[away])), gather_rows(comm, feet[away])
-    points = np.zeros((len(feet), 3))
-    points[:, : feet.shape[1]] = feet
+    # Closest points of the obstacle, moved into it by the round-off.
+    closest = values.x + (gap + tolerance)[:, None] * normal
+    bodies, closest = np.concatenate(comm.allgather(body[away])), gather_rows(comm, closest[away])
+    points = np.zeros((len(closest), 3))
+    points[:, : closest.shape[1]] = closest
     enclosed = []
     if len(points) and len(nodes):
         tree = dolfinx.geometry.bb_tree(mesh, mesh.topology.dim)
-        near = dolfinx.geometry.compute_collisions_points(tree, points)
-        cells = dolfinx.geometry.compute_colliding_cells(mesh, near, points)
-        met = (of_node[nodes[cells.links(k), 0]] for k in range(len(points)))
-        enclosed = [k for k, bodies in enumerate(met) if of_foot[k] in bodies]
-    first = comm.allreduce(min(enclosed, default=len(feet)), op=MPI.MIN)
-    if first < len(feet):
+        candidates = dolfinx.geometry.compute_collisions_points(tree, points)
+        cells = dolfinx.geometry.compute_colliding_cells(mesh, candidates, points)
+        around = (body_of_node[nodes[cells.links(k), 0]] for k in range(len(points)))
+        enclosed = [k for k, colliding in enumerate(around) if bodies[k] in colliding]
+    first = comm.allreduce(min(enclosed, default=len(closest)), op=MPI.MIN)
+    if first < len(closest):
         raise ValueError(
             f"{contact.name}: the obstacle is inside of the undeformed body, as at "
-            f"{place_in_words(feet[first])}, and all of the body's Γc faces away from it: "
-            "check its place, its units and the direction of its normal"
+            f"{place_in_words(closest[first])}, and all of the body's Γc faces away from it: "
+            "check its position, its units and the direction of its normal"
         )
 
 
 def _warn_of_few_points(contact: Contact) -> None:
-    """Say of how many facets opposite the points of one of Γc are not enough. Collective."""
+    """Warn if the quadrature does not resolve the opposing facets or the element. Collective."""
     sparse = contact.quadrature.sparse
     if sparse is not None:
         warn(
@@ -279,13 +277,13 @@ def _warn_of_few_points(contact: Contact) -> None:
         )
 
 
-def _warn_of_doubles(contacts: Sequence[Contact]) -> None:
-    """Say which two contacts share the force of what is one obstacle. Collective."""
+def _warn_of_shared_obstacles(contacts: Sequence[Contact]) -> None:
+    """Warn of pairs of contacts with the same obstacle on the same facets. Collective."""
     if len(contacts) < 2:
         return
     comm, pairs = contacts[0].surface.mesh.comm, list(combinations(contacts, 2))
-    shared = comm.allreduce(np.array([_n_doubled(*pair) for pair in pairs]))
-    for (one, other), n_facets in zip(pairs, shared, strict=True):
+    counts = comm.allreduce(np.array([_count_shared_facets(*pair) for pair in pairs]))
+    for (one, other), n_facets in zip(pairs, counts, strict=True):
         if n_facets:
             warn(
                 comm,
@@ -295,23 +293,23 @@ def _warn_of_doubles(contacts: Sequence[Contact]) -> None:
             )
 
 
-def _n_doubled(one: Contact, other: Contact) -> int:
-    """Facets of this rank where two obstacles of one kind that move as one are at one place."""
-    mine, theirs = one.obstacle, other.obstacle
-    if one.free_motion or other.free_motion:  # each moves by its own force
+def _count_shared_facets(one: Contact, other: Contact) -> int:
+    """Return the number of this rank's facets on which two contacts have the same obstacle."""
+    first, second = one.obstacle, other.obstacle
+    if one.free_motion or other.free_motion:  # two independent obstacles
         return 0
-    moved = mine.displacement is theirs.displacement or mine.displacement == theirs.displacement
-    if type(mine) is not type(theirs) or mine.rotation is not theirs.rotation or not np.all(moved):
+    same = first.displacement is second.displacement or first.displacement == second.displacement
+    if type(first) is not type(second) or first.rotation is not second.rotation or not np.all(same):
         return 0
     _, *shared = np.intersect1d(one.surface.facets, other.surface.facets, return_indices=True)
-    places, facing = [], np.ones(len(shared[0]), dtype=np.bool_)
+    geometry, facing = [], np.ones(len(shared[0]), dtype=np.bool_)
     for contact, rows in zip((one, other), shared, strict=True):
         points, values = contact.quadrature.point_rows[rows], contact.values
-        # Means, as rules may differ, and the order of points on a facet does.
+        # Means over the facet: quadrature rules and orders of the points differ.
         gap = contact.contact_kinematics.undeformed_gap(values)
-        places.append([a[points].mean(axis=1) for a in (gap, values.normal)])
+        geometry.append([a[points].mean(axis=1) for a in (gap, values.normal)])
         facing &= np.all(values.paired[points], axis=1)
-    gaps, normals = (np.abs(a - b) for a, b in zip(*places, strict=True))
+    gaps, normals = (np.abs(a - b) for a, b in zip(*geometry, strict=True))
     extent = np.abs(one.points).max(initial=0.0)
-    same = (gaps <= ROUND_OFF * extent) & np.all(normals <= ROUND_OFF, axis=1)
-    return int(np.count_nonzero(same & facing))
+    coincide = (gaps <= ROUND_OFF * extent) & np.all(normals <= ROUND_OFF, axis=1)
+    return int(np.count_nonzero(coincide & facing))

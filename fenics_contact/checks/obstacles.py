@@ -1,4 +1,4 @@
-"""Verification of a rigid obstacle: distance gradient, depth and rotation per increment."""
+"""Verification of a rigid obstacle: gradient of its distance, penetration and rotation."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from fenics_contact.parallel import global_max
 __all__ = ["ObstacleCheck"]
 
 
-# Largest difference of the gradient of a distance from minus its unit normal where contact is.
-_GRADIENT_ERROR = 0.05
-# Penetration by the radius of curvature that is left there: 1 is half of that of the obstacle.
-_DEEP = 1.0
-# Of the angle that an obstacle turns by in an increment (radians): a right one and round-off.
-# Beyond two of them the straight way of a point leads backwards.
-_TURN = np.pi / 2 + 1e-9
+# Largest difference between the gradient of a distance and minus its unit normal.
+_MAX_GRADIENT_ERROR = 0.05
+# Penetration relative to the distance from the centre of curvature: 1 is half of the radius.
+_MAX_CURVATURE_DEPTH_RATIO = 1.0
+# Rotation of an obstacle in one increment (radians): a right angle and round-off. Beyond two right
+# angles the straight path of a point leads backwards.
+_MAX_ROTATION = np.pi / 2 + 1e-9
 
 
 @dataclass(frozen=True)
@@ -30,17 +30,16 @@ class ObstacleCheck:
     Attributes:
         obstacle: The class of the obstacle.
         gradient_error: Largest difference between the gradient of the gap and minus the normal, at
-            closed points; NaN if gap or gradient are no numbers. 0 of a gap given on Γc, which has
-            no gradient.
+            closed points; NaN if gap or gradient is NaN; 0 for a gap prescribed on Γc.
         depth: With finite kinematics, the largest penetration divided by the distance from there to
             the centre of curvature of the obstacle.
-        turn: Rotation of the obstacle in this increment, with friction (radians).
+        rotation: Rotation of the obstacle in this increment, with friction (radians).
     """
 
     obstacle: str
     gradient_error: float
     depth: float
-    turn: float = 0.0
+    rotation: float = 0.0
 
     @classmethod
     def of(cls, contact: Contact) -> ObstacleCheck:
@@ -48,7 +47,7 @@ class ObstacleCheck:
         comm, closed = contact.surface.mesh.comm, contact.status != Status.OPEN
         errors, depth = contact.contact_kinematics.gradient_error(contact.values), 0.0
         if contact.finite:
-            # No law takes a gap for closed that is not a number, or has no normal.
+            # A NaN gap, or one without a normal, is not closed by any law.
             gap, _ = contact.contact_kinematics.true_placement(contact.values)
             errors = np.where(np.isnan(gap), np.nan, errors)
             closed |= ~(gap > 0) & np.isnan(errors)
@@ -56,17 +55,18 @@ class ObstacleCheck:
         curvature = contact.contact_kinematics.largest_curvature()
         if curvature is not None and not contact.obstacle.is_flat:
             depth = global_max(comm, (contact.values.penetration * curvature)[closed])
-        rubs = contact.law.has_friction and comm.allreduce(int(closed.any())) > 0
-        turn = abs(contact.contact_kinematics.turned_by(contact.values)) if rubs else 0.0
-        return cls(type(contact.obstacle).__name__, error, depth, turn)
+        has_friction = contact.law.has_friction and comm.allreduce(int(closed.any())) > 0
+        angle = abs(contact.contact_kinematics.turned_by(contact.values)) if has_friction else 0.0
+        return cls(type(contact.obstacle).__name__, error, depth, angle)
 
     def conditions(self, contact: str) -> list[Condition]:
-        """The conditions on a contact of this name."""
+        """Return the conditions on a contact of this name."""
         distance = (
             f"in the contact zone the gradient of the gap of the {self.obstacle} differs by "
             f"{self.gradient_error:.3g} from minus its unit normal; it must be a distance, with a "
             "gradient of length 1, and its direction minus the gradient: divide the function by "
-            "the length of its gradient, or give a gap along another direction as PrescribedGap"
+            "the length of its gradient, or prescribe a gap along another direction by "
+            "PrescribedGap"
         )
         if np.isnan(self.gradient_error):
             distance = (
@@ -78,15 +78,15 @@ class ObstacleCheck:
             "closest point may be on its other side; increase k_n, or use "
             'enforcement="augmented"'
         )
-        turned = (
-            f"the obstacle rotates by {self.turn:.3g} rad in one increment, over which slip is a "
-            "straight line; rotate it by no more than a right angle per increment"
+        rotation = (
+            f"the obstacle rotates by {self.rotation:.3g} rad in one increment, over which slip "
+            "is a straight line; rotate it by no more than a right angle per increment"
         )
         return [
             Condition(f"{name}, {contact}", value, limit, f"{contact}: {failure}")
             for name, value, limit, failure in (
-                ("gradient of the gap", self.gradient_error, _GRADIENT_ERROR, distance),
-                ("depth by radius of curvature", self.depth, _DEEP, deep),
-                ("rotation of the obstacle", self.turn, _TURN, turned),
+                ("gradient of the gap", self.gradient_error, _MAX_GRADIENT_ERROR, distance),
+                ("depth by radius of curvature", self.depth, _MAX_CURVATURE_DEPTH_RATIO, deep),
+                ("rotation of the obstacle", self.rotation, _MAX_ROTATION, rotation),
             )
         ]
