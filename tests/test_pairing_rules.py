@@ -486,7 +486,7 @@ def test_a_pin_in_a_hole_is_not_held_by_the_contact_around_it(kinematics):
         for name, tag in (("slabs", LOWER), ("pin", BOTH))
     ]
     problem = body.problem(*contacts)
-    raised_everywhere(problem.solve, fc.NotConverged, "pin: what lies opposite penetrates")
+    raised_everywhere(problem.solve, fc.NotConverged, "pin: the obstacle penetrates")
 
 
 def test_touching_is_no_penetration():

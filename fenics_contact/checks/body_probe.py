@@ -102,7 +102,7 @@ class OpposingBodyProbe:
             return hits
         return hits.completed(lost, side.trace(rays, lost, self.u, np.full(n, np.inf)))
 
-    def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
+    def is_at_commit(self, contact: Contact, before: fem.Function) -> bool:
         """Whether this rank's displacement is that of the last commit."""
         return bool(np.array_equal(self.u.x.array, before.x.array))
 

@@ -157,7 +157,7 @@ class RigidObstacleProbe:
         facets, references, distances, normals = map(np.concatenate, zip(*found, strict=True))
         return facets, references, distances, normals
 
-    def is_of_committed(self, contact: Contact, before: fem.Function) -> bool:
+    def is_at_commit(self, contact: Contact, before: fem.Function) -> bool:
         """Whether points and shape of this rank are those of the last commit, in its frame."""
         committed = contact.values.x + contact.contact_kinematics.committed_jump
         is_shape = np.array_equal(self._shape, self.sampler.committed_shape)

@@ -20,12 +20,9 @@ _DIVIDED_FORCE_RATIO = 0.08
 
 
 def warn_of_few_points(contact: Contact) -> bool:
-    """Warn if loaded facets are too long for the curvature of a rigid obstacle. Collective.
+    """Warn if facets are too long for the obstacle's curvature; return whether so. Collective.
 
     If the radius is known when the contact is created, `ContactSurface` uses enough points.
-
-    Returns:
-        Whether it has warned.
     """
     quadrature, comm = contact.quadrature, contact.surface.mesh.comm
     curvature = contact.contact_kinematics.largest_curvature()
@@ -51,12 +48,9 @@ def warn_of_few_points(contact: Contact) -> bool:
 
 
 def warn_of_divided_facets(contact: Contact) -> bool:
-    """Warn if the boundary of the opposing surface divides loaded facets. Collective.
+    """Warn if the opposing surface ends within loaded facets; return whether so. Collective.
 
-    Its position along a facet is resolved to half of the distance between two quadrature points.
-
-    Returns:
-        Whether it has warned.
+    The position of its boundary is resolved to half of the distance between two points.
     """
     if not contact.contact_kinematics.follows:
         return False

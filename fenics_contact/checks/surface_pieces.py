@@ -1,4 +1,4 @@
-"""The flat pieces of Γc on all ranks, and how deep points are below them."""
+"""The flat pieces of Γc on all ranks, and the depth of points below them."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from fenics_contact.types import Array, Index, Mask
 __all__ = ["SurfacePieces", "depth_below_surface"]
 
 # Cosine of the angle between the normals of two faces that meet at an edge: 60 degrees and more.
-_EDGE = 0.5
+_EDGE_COSINE = 0.5
 
 
 @dataclass(frozen=True)
 class SurfacePieces:
-    """The flat pieces of Γc.
+    """The flat pieces of Γc, n on all ranks.
 
     Attributes:
-        comm: The ranks.
-        facets: Those of this rank, at rest.
-        allowed: Allowed depth below each of all, (n,) (length).
-        corner: Its first corner, (n, gdim) (length).
-        normal: Its outward unit normal, (n, gdim).
-        middle: Its middle on the undeformed Γc, (n, gdim) (length).
+        comm: Communicator.
+        facets: This rank's pieces, at rest.
+        allowed: Allowed depth below each piece, (n,) (length).
+        corner: First corner of each piece, (n, gdim) (length).
+        normal: Outward unit normals, (n, gdim).
+        middle: Midpoints on the undeformed Γc, (n, gdim) (length).
     """
 
     comm: MPI.Comm
@@ -43,14 +43,14 @@ class SurfacePieces:
     def of(
         cls, comm: MPI.Comm, places: FacetPlaces, field: Array, facet: Index, allowed: Array
     ) -> SurfacePieces:
-        """Collect them on all ranks. Collective.
+        """Gather the pieces of all ranks. Collective.
 
         Args:
-            comm: The ranks.
-            places: Of Γc.
-            field: The nodes of Γc, (n_nodes, gdim) (length).
-            facet: Facet of this rank of some places, (n,).
-            allowed: Allowed depth at these, (n,) (length).
+            comm: Communicator.
+            places: The sampling positions of Γc.
+            field: Positions of the nodes of Γc, (n_nodes, gdim) (length).
+            facet: This rank's facet of each sampling position, (n,).
+            allowed: Allowed depth there, (n,) (length).
         """
         most: Array = np.zeros(len(places.size))
         np.maximum.at(most, facet, allowed)
@@ -61,48 +61,46 @@ class SurfacePieces:
         return cls(comm, facets, table[:, 0], *np.split(table[:, 1:], 3, axis=1))
 
     def is_shallow(self, points: Array, normal: Array) -> Mask:
-        """Find points that are no deeper below another face than is allowed there. Collective.
+        """Return whether points are within the allowed depth below an adjacent face. Collective.
 
-        At an edge of the body what is deep below one face may have hardly entered the other one.
-        Faces opposite to the first one do not count: what is close to them has gone through.
+        Near an edge of the body a point deep below one face may have hardly entered through the
+        other one. Opposite faces do not count: a point close to them has passed through the body.
 
         Args:
-            points: (n, gdim) (length).
+            points: Positions, (n, gdim) (length).
             normal: Outward unit normal of the facet that each is deep below, (n, gdim).
         """
         depth = -np.einsum("nmd,md->nm", points[:, None] - self.corner, self.normal)
         near = (depth >= 0) & (depth <= self.allowed)
         cosine = normal @ self.normal.T
-        row, facet = np.nonzero(near & (cosine > OPPOSITE_SIDES) & (cosine < _EDGE))
+        row, facet = np.nonzero(near & (cosine > OPPOSITE_SIDES) & (cosine < _EDGE_COSINE))
         reach = 2 * depth[row, facet] + DEPTH_RESOLUTION * self.allowed[facet]
         outward = self.normal[facet]
-        _, met = depth_below_surface(self.comm, points[row], outward, reach, self.facets)
-        found = np.zeros(len(points), dtype=np.bool_)
-        found[row[met == facet]] = True
-        return found
+        _, facet_above = depth_below_surface(self.comm, points[row], outward, reach, self.facets)
+        shallow = np.zeros(len(points), dtype=np.bool_)
+        shallow[row[facet_above == facet]] = True
+        return shallow
 
 
 def depth_below_surface(
     comm: MPI.Comm, points: Array, outward: Array, reach: Array, facets: MovingFacets
 ) -> tuple[Array, Index]:
-    """How deep points are below Γc, along outward directions. Collective.
-
-    Beside Γc a point is below none of its facets.
+    """Return the depth of points below Γc, along given directions. Collective.
 
     Args:
-        comm: The ranks.
-        points: (n, gdim) (length).
-        outward: Unit vectors, (n, gdim).
-        reach: How far Γc is looked for, (n,) (length).
+        comm: Communicator.
+        points: Positions, (n, gdim) (length).
+        outward: Unit vectors along which Γc is searched, (n, gdim).
+        reach: Length of the search, (n,) (length).
         facets: Γc, at rest.
 
     Returns:
-        The depth, (n,) (length), and the number of the facet among those of all ranks, (n,), -1
-        for points that are not below Γc.
+        The depth, (n,) (length), and the global number of the facet, (n,), -1 for points that are
+        not below Γc.
     """
     vertices, end = np.full((len(points), 1), -1), points + reach[:, None] * outward
-    met = find_crossings(comm, points, end, vertices, facets)
-    first = np.append(True, np.diff(met.place) > 0)[: len(met.place)] & ~met.inward
-    place, depth, facet = met.place[first], np.zeros(len(points)), np.full(len(points), -1)
-    depth[place], facet[place] = met.time[first] * reach[place], met.facet[first]
+    hits = find_crossings(comm, points, end, vertices, facets)
+    first = np.append(True, np.diff(hits.place) > 0)[: len(hits.place)] & ~hits.inward
+    place, depth, facet = hits.place[first], np.zeros(len(points)), np.full(len(points), -1)
+    depth[place], facet[place] = hits.time[first] * reach[place], hits.facet[first]
     return depth, facet
