@@ -1,4 +1,4 @@
-"""Places of both surfaces of a contact between bodies, where these have moved to."""
+"""Positions on both surfaces of a contact between two bodies, in the deformed bodies."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ __all__ = ["OpposingBodyProbe"]
 
 
 class OpposingBodyProbe:
-    """Places of Γc and of the opposite surface, both where their bodies have moved to.
+    """Positions on Γc (slave) and on the opposing surface (master) in the deformed bodies.
 
-    The constructor follows the present normals of both surfaces to the other one. It is collective.
+    The constructor traces the present normals of both surfaces to the other one. It is collective.
 
     Args:
-        before: The displacement at the last commit; None: paths are not followed.
-        known: An earlier probe, from which on paths were not followed yet.
+        before: Displacement at the last commit; None: paths are not verified.
+        known: The probe up to which paths are verified, if there is one.
 
     Attributes:
-        x: Where they are on the undeformed surfaces, those of Γc first, (n, gdim) (length).
-        resisted: On the facets of Γc, and on those opposite: corners of facets, (m, n_corners), and
-            the penetration of points there that the law resists, (m,) (length).
+        x: Undeformed positions, those of Γc first, (n, gdim) (length).
+        resisted: For Γc and for the master surface, the corners of facets, (m, n_corners), and the
+            penetration of points there that the law resists, (m,) (length).
         u: The displacement.
     """
 
@@ -50,143 +50,138 @@ class OpposingBodyProbe:
         self._comm = contact.surface.mesh.comm
         self._rows = contact.quadrature.point_rows
         values = contact.values
-        here, there = search.rays.here, search.rays.there
+        slave, master = search.rays.here, search.rays.there
         deepest = global_max(self._comm, values.depth)
-        near, opposite = search.nearby(self.u, self._before, deepest)
-        found = search.present_hits(values.x, contact.u, values.depth, near)
-        self._here = _Side(here, self.u, found.facet, found.reference)
-        self._there = _Side(there, self.u, *there.facets.lattice(opposite))
-        everywhere, n_back = np.arange(len(self._there.facet)), len(self._there.side.body)
-        back = self._there.trace(search.rays, everywhere, self.u, np.full(n_back, deepest))
+        near, opposing = search.nearby(self.u, self._before, deepest)
+        present = search.present_hits(values.x, contact.u, values.depth, near)
+        self._slave = _Surface(slave, self.u, present.facet, present.reference)
+        self._master = _Surface(master, self.u, *master.facets.lattice(opposing))
+        everywhere, n_facets = np.arange(len(self._master.facet)), len(self._master.side.body)
+        hits = self._master.trace(search.rays, everywhere, self.u, np.full(n_facets, deepest))
         before = global_max(self._comm, contact.history.values("penetration"))
-        self._hits = self._with_lost(self._here, found.hits, before)
-        self._back = self._with_lost(self._there, back, before)
-        self.x = np.concatenate([self._here.undeformed, self._there.undeformed])
+        self._slave_hits = self._with_lost(self._slave, present.hits, before)
+        self._master_hits = self._with_lost(self._master, hits, before)
+        self.x = np.concatenate([self._slave.undeformed, self._master.undeformed])
         n = contact.quadrature.n_points
-        gap, partner = self._hits.distance[:n], self._hits.facet[:n]
+        gap, partner = self._slave_hits.distance[:n], self._slave_hits.facet[:n]
         closed = contact.status != Status.OPEN
-        deep = np.maximum(values.penetration, np.where(closed, -np.nan_to_num(gap), 0.0))
-        met = (deep > 0) & (partner >= 0)
+        resisted = np.maximum(values.penetration, np.where(closed, -np.nan_to_num(gap), 0.0))
+        paired = (resisted > 0) & (partner >= 0)
         self.resisted = [
-            (
-                here.corners[here.own],
-                deep[self._rows].max(axis=1, initial=0.0),
-            ),
-            (there.corners[partner[met]], deep[met]),
+            (slave.corners[slave.own], resisted[self._rows].max(axis=1, initial=0.0)),
+            (master.corners[partner[paired]], resisted[paired]),
         ]
-        self._planes = self._tangent_planes(deep)
-        # What lies aside of the normals may be nearer than what they meet.
+        self._planes = self._tangent_planes(resisted)
+        # Facets beside the normals, or beyond the `nearby` ones, may be nearer than the hits: the
+        # latter are at least a height away.
         depth, allowed = self.depth(ResistedDepth.of(self._comm, [], []))
-        # So may facets beyond the `nearby` ones, which are a height away at least.
-        clear = allowed - np.maximum(depth, 0.0)
-        heights = np.concatenate([here.height, there.height])
-        self._clear = global_min(self._comm, np.append(clear, heights))
+        clearance = allowed - np.maximum(depth, 0.0)
+        heights = np.concatenate([slave.height, master.height])
+        self._clearance = global_min(self._comm, np.append(clearance, heights))
 
-    def _with_lost(self, side: _Side, hits: Hits, deepest: float) -> Hits:
-        """Find the opposite of places that were inside of the other body and lost it. Collective.
-
-        Rays look as deep as the points are. A place that was inside may have gone deeper.
+    def _with_lost(self, surface: _Surface, hits: Hits, deepest: float) -> Hits:
+        """Trace positions without a hit that were inside of the other body further. Collective.
 
         Args:
-            side: Where the places are.
-            hits: What their rays meet.
+            surface: The surface with the positions.
+            hits: Hits of rays that are as long as the largest penetration of the points.
             deepest: Penetration of the points at the last commit (length).
         """
         lost = np.flatnonzero(np.isnan(hits.distance))
         if self._before is None or not self._comm.allreduce(len(lost)):
             return hits
-        rays, n = self._search.rays, len(side.side.body)
-        was = side.trace(rays, lost, self._before, np.full(n, deepest))
-        lost = lost[was.distance < 0]
+        rays, n = self._search.rays, len(surface.side.body)
+        committed = surface.trace(rays, lost, self._before, np.full(n, deepest))
+        lost = lost[committed.distance < 0]
         if not self._comm.allreduce(len(lost)):
             return hits
-        return hits.completed(lost, side.trace(rays, lost, self.u, np.full(n, np.inf)))
+        return hits.completed(lost, surface.trace(rays, lost, self.u, np.full(n, np.inf)))
 
     def is_at_commit(self, contact: Contact, before: fem.Function) -> bool:
         """Whether this rank's displacement is that of the last commit."""
         return bool(np.array_equal(self.u.x.array, before.x.array))
 
     def is_valid_for(self, contact: Contact) -> bool:
-        """Whether nothing can be found at the present state that was not there. Collective.
-
-        Both surfaces must have moved less since than they are clear of each other.
-        """
+        """Whether both surfaces have moved by less than their clearance since. Collective."""
         change = (contact.u.x.array - self.u.x.array).reshape(-1, self.x.shape[1])
-        ways = [change[side.side.facets.nodes.ravel()] for side in (self._here, self._there)]
-        common = global_mean(self._comm, np.concatenate(ways))
-        most = (global_max(self._comm, np.linalg.norm(way - common, axis=1)) for way in ways)
-        return bool(sum(most) <= self._clear)
+        changes = [change[one.side.facets.nodes.ravel()] for one in (self._slave, self._master)]
+        common = global_mean(self._comm, np.concatenate(changes))
+        lengths = (global_max(self._comm, np.linalg.norm(c - common, axis=1)) for c in changes)
+        return bool(sum(lengths) <= self._clearance)
 
     def depth(self, resisted: ResistedDepth) -> tuple[Array, Array]:
-        """Penetration at the places, and what is allowed there, (n,) (length). Collective."""
-        here, there, hits, back = self._here, self._there, self._hits, self._back
-        on = np.concatenate([here.number, back.facet])  # the facet of Γc, of those of all ranks
-        opposite = np.concatenate([hits.facet, there.number])
-        resisted_here, resisted_there = (
-            np.where(number >= 0, resisted.at(side.side.corners)[number], 0.0)
-            for side, number in ((here, on), (there, opposite))
+        """Return penetration and allowed penetration, (n,) each (length). Collective."""
+        slave, master, hits = self._slave, self._master, self._master_hits
+        # Facets of all ranks: of Γc, and opposing ones.
+        on_slave = np.concatenate([slave.number, hits.facet])
+        on_master = np.concatenate([self._slave_hits.facet, master.number])
+        around_slave, around_master = (
+            np.where(number >= 0, resisted.at(surface.side.corners)[number], 0.0)
+            for surface, number in ((slave, on_slave), (master, on_master))
         )
-        deep = np.maximum(resisted_here, resisted_there)
-        edges = np.sqrt(self.x.shape[1] - 1)  # lengths are those of diagonals in space
-        size, other = here.side.length[on] / edges, there.side.length[opposite] / edges
-        slack = here.side.faceting[on] + there.side.faceting[opposite]
-        met = ~np.isnan(np.concatenate([hits.distance, back.distance]))
-        # A place opposite stands for the one of Γc that its normal meets.
-        foot = there.place + np.nan_to_num(back.distance)[:, None] * there.normal
-        planes = depth_below(np.concatenate([here.place, foot]), *(p[on] for p in self._planes))
-        planes[on < 0] = -np.inf
-        smaller = np.where(met, np.minimum(size, other), np.where(on >= 0, size, other))
-        allowed = allowed_depth(deep, planes, size, smaller) + np.where(met, slack, 0.0)
-        depth = np.concatenate([_depth(hits, here), _depth(back, there)])
-        return np.where(met, depth, 0.0), allowed
+        around = np.maximum(around_slave, around_master)
+        edges = np.sqrt(self.x.shape[1] - 1)  # in three dimensions lengths are those of diagonals
+        size, other = slave.side.length[on_slave] / edges, master.side.length[on_master] / edges
+        faceting = slave.side.faceting[on_slave] + master.side.faceting[on_master]
+        paired = ~np.isnan(np.concatenate([self._slave_hits.distance, hits.distance]))
+        # For positions of the master surface, the planes at their projections onto Γc.
+        projection = master.place + np.nan_to_num(hits.distance)[:, None] * master.normal
+        positions = np.concatenate([slave.place, projection])
+        planes = depth_below(positions, *(p[on_slave] for p in self._planes))
+        planes[on_slave < 0] = -np.inf
+        smaller = np.where(paired, np.minimum(size, other), np.where(on_slave >= 0, size, other))
+        allowed = allowed_depth(around, planes, size, smaller) + np.where(paired, faceting, 0.0)
+        depth = np.concatenate([_depth(self._slave_hits, slave), _depth(hits, master)])
+        return np.where(paired, depth, 0.0), allowed
 
     def _tangent_planes(self, resisted: Array) -> tuple[Array, Array]:
-        """Those of the opposite surface, of the facets of all ranks, see `tangent_planes_around`.
-
-        Collective.
+        """Gather `tangent_planes_around` of the master surface for all ranks' facets. Collective.
 
         Args:
             resisted: Penetration at the points that the law resists, (n_points,) (length).
         """
-        n, here = self._rows.size, self._here
-        ray, normal = here.normal[:n], _normals(self._hits)[:n]
-        through = here.place[:n] + self._hits.distance[:n, None] * ray
+        n, slave = self._rows.size, self._slave
+        ray, normal = slave.normal[:n], _normals(self._slave_hits)[:n]
+        through = slave.place[:n] + self._slave_hits.distance[:n, None] * ray
         normal = normal * -np.sign(dot(normal, ray))[:, None]
-        corners = here.side.corners[here.side.own]
+        corners = slave.side.corners[slave.side.own]
         planes = through[self._rows], normal[self._rows]
         planes = tangent_planes_around(self._comm, corners, resisted[self._rows], *planes)
         through, normal = (gather_rows(self._comm, v) for v in planes)
         return through, normal
 
     def crossed(self, allowed: Array) -> Array:
-        """Find the undeformed places, (n, gdim) (length), that crossed the opposite. Collective.
+        """Return the undeformed positions that crossed the other surface. Collective.
 
-        A place has crossed if it came in through a facet and is deeper than is allowed at the end,
-        or has left the body through its opposite side.
+        A position has crossed if it entered through a facet and is deeper than is allowed at the
+        end, or has left the body through its opposite side.
+
+        Returns:
+            Array (n, gdim) (length).
         """
         if self._before is None:
             return self.x[:0]
-        here, there, n = self._here, self._there, len(self._here.facet)
-        # What both surfaces have in common of their motion crosses nothing.
-        shift = global_mean(self._comm, here.place - here.at(self._before))
-        found = [
+        slave, master, n = self._slave, self._master, len(self._slave.facet)
+        # The mean translation of both surfaces is removed.
+        shift = global_mean(self._comm, slave.place - slave.at(self._before))
+        masks = [
             one.crossed(self._before, shift, other, allowed[part], _depth(hits, one))
             for one, other, part, hits in (
-                (here, there, slice(n), self._hits),
-                (there, here, slice(n, None), self._back),
+                (slave, master, slice(n), self._slave_hits),
+                (master, slave, slice(n, None), self._master_hits),
             )
         ]
-        return self.x[np.concatenate(found)]
+        return self.x[np.concatenate(masks)]
 
 
-class _Side:
-    """Places of one of two surfaces in the bodies displaced by u. The constructor is collective.
+class _Surface:
+    """Positions on one surface in the bodies displaced by u. The constructor is collective.
 
     Attributes:
         side: The surface.
-        facet, reference: Facet of this rank and reference coordinates of every place.
-        number: Of the facet among those of all ranks, (n,).
-        undeformed, place: Where the places are, (n, gdim) (length).
+        facet, reference: This rank's facet and reference coordinates of every position.
+        number: Global number of the facet, (n,).
+        undeformed, place: Undeformed and deformed positions, (n, gdim) (length).
         normal: Outward unit normals of the deformed surface there, (n, gdim).
     """
 
@@ -198,17 +193,17 @@ class _Side:
         self.normal = side.facets.normals(facet, reference, u)
 
     def at(self, u: fem.Function | None) -> Array:
-        """The places in the bodies displaced by u, (n, gdim) (length)."""
+        """Return the positions in the bodies displaced by u, (n, gdim) (length)."""
         return self.side.facets.positions(self.facet, self.reference, u)[0]
 
     def trace(self, rays: Rays, some: Index, u: fem.Function, deep: Array) -> Hits:
-        """What the normals of the surface meet of the other one. Collective.
+        """Trace the normals of the surface to the other one. Collective.
 
         Args:
-            rays: Between both surfaces.
-            some: Numbers of the places, (m,).
+            rays: The rays between both surfaces.
+            some: Indices of the positions, (m,).
             u: Displacement of the bodies.
-            deep: Penetration at each of all facets of the surface (length).
+            deep: Penetration bound of every facet of the surface (length).
         """
         facet, reference = self.facet[some], self.reference[some]
         facets = self.side.facets
@@ -224,58 +219,57 @@ class _Side:
         )
 
     def moving(self, before: fem.Function, shift: Array) -> MovingFacets:
-        """The facets of this rank in the increment, its start moved by a shift."""
+        """Return this rank's facets in the increment, with their start moved by a shift."""
         side, facets = self.side, self.side.facets
         start, end = facets.moved_corners(before) + shift, facets.moved_corners(self._u)
         return MovingFacets(start, end, facets.outward, side.vertices[side.own])
 
     def crossed(
-        self, before: fem.Function, shift: Array, other: _Side, allowed: Array, depth: Array
+        self, before: fem.Function, shift: Array, other: _Surface, allowed: Array, depth: Array
     ) -> Mask:
-        """Which places have crossed the other surface, (n,). Collective.
+        """Return which positions have crossed the other surface, (n,). Collective.
 
         Args:
             before: Displacement at the last commit.
-            shift: What both surfaces have in common of their motion, (gdim,) (length).
-            other: The places of the other surface.
-            allowed: Penetration that is allowed, (n,) (length).
-            depth: Below what their normals meet, (n,) (length). Of those that are behind it this
-                is all that counts: one that slides on along a curved surface leaves the facet
-                through which it came in behind.
+            shift: Mean translation of both surfaces, (gdim,) (length).
+            other: The other surface.
+            allowed: Allowed penetration, (n,) (length).
+            depth: Penetration along the normals, (n,) (length), NaN without a hit. If it is
+                positive, the depth below the facet of entry does not count: a position may slide
+                on along a curved surface.
         """
         vertices = self.side.vertices[self.number]
         start = self.at(before) + shift
         facets = other.moving(before, shift)
-        met = find_crossings(self._comm, start, self.place, vertices, facets)
-        found = np.zeros(len(self.facet), dtype=np.bool_)
-        n = len(met.place)
-        first = np.append(True, np.diff(met.place) > 0)[:n]
-        last = np.append(np.diff(met.place) > 0, True)[:n]
-        place, leaves = met.place[last], ~met.inward[last]
-        # Of a place that was inside from the start, through the side that its own normal met.
-        entry = np.where(met.inward[first][:, None], met.normal[first], -self.normal[place])
-        through = leaves & (dot(entry, met.normal[last]) < OPPOSITE_SIDES)
-        found[place] = through
-        known = depth[place] >= 0  # and compared with what is allowed
-        deep = ~leaves & ~known & (met.depth[last] > allowed[place])
-        # One that slides on and leaves the body sideways is deep below a facet that it has left.
-        which, since = place[deep], met.time[last][deep]
-        ends = start[which], self.place[which]
-        path = largest_depth_on_path(self._comm, *ends, since, vertices[which], facets)
-        found[which] |= path > allowed[which]
-        return found
+        hits = find_crossings(self._comm, start, self.place, vertices, facets)
+        crossed = np.zeros(len(self.facet), dtype=np.bool_)
+        n = len(hits.place)
+        first = np.append(True, np.diff(hits.place) > 0)[:n]
+        last = np.append(np.diff(hits.place) > 0, True)[:n]
+        place, leaves = hits.place[last], ~hits.inward[last]
+        # A position that was inside from the start has entered through the side at its normal.
+        entry = np.where(hits.inward[first][:, None], hits.normal[first], -self.normal[place])
+        crossed[place] = leaves & (dot(entry, hits.normal[last]) < OPPOSITE_SIDES)
+        penetrates = depth[place] >= 0  # compared with the allowed depth elsewhere
+        deep = ~leaves & ~penetrates & (hits.depth[last] > allowed[place])
+        # A position that slides sideways off the body is deep below a facet that it has left.
+        index, since = place[deep], hits.time[last][deep]
+        ends = start[index], self.place[index]
+        path = largest_depth_on_path(self._comm, *ends, since, vertices[index], facets)
+        crossed[index] |= path > allowed[index]
+        return crossed
 
 
-def _depth(hits: Hits, side: _Side) -> Array:
-    """How deep places are below what their normals meet, (n,) (length); NaN where they meet none.
+def _depth(hits: Hits, surface: _Surface) -> Array:
+    """Return the depth of positions below the surface hit by their normals, (n,) (length).
 
-    A ray that grazes what it meets is longer than the place is deep below that.
+    It is NaN without a hit. A grazing ray is longer than its origin is deep.
     """
-    return -hits.distance * abs(dot(_normals(hits), side.normal))
+    return -hits.distance * abs(dot(_normals(hits), surface.normal))
 
 
 def _normals(hits: Hits) -> Array:
-    """Unit normals, of any sign, where rays have met a surface, (n, d); 0 where they have not."""
+    """Return unit normals, of any sign, at the hits of rays, (n, d); 0 without a hit."""
     normal = across(hits.partner.tangents)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     return np.asarray(normal / np.where(length > 0, length, 1.0))
