@@ -72,8 +72,8 @@ class OpposingBodyProbe:
             (master.corners[partner[paired]], resisted[paired]),
         ]
         self._planes = self._tangent_planes(resisted)
-        # Facets beside the normals, or beyond the `nearby` ones, may be nearer than the hits: the
-        # latter are at least a height away.
+        # Facets beside the normals may be nearer than the hits; those beyond the `nearby` ones are
+        # at least a height away.
         depth, allowed = self.depth(ResistedDepth.of(self._comm, [], []))
         clearance = allowed - np.maximum(depth, 0.0)
         heights = np.concatenate([slave.height, master.height])
