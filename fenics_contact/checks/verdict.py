@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fenics_contact.checks.condition import Condition
-from fenics_contact.checks.kinematics import Linearisation
+from fenics_contact.checks.kinematics import SmallDisplacementError
 from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.tunnelling import Tunnelling
 from fenics_contact.contact.contact import Contact
@@ -131,7 +131,7 @@ class Verdict:
     enforcement_tolerance: dict[str, float] = field(default_factory=dict)
     obstacles: dict[str, ObstacleCheck] = field(default_factory=dict)
     tunnelling: dict[str, Tunnelling] = field(default_factory=dict)
-    small_displacement_error: dict[str, Linearisation] = field(default_factory=dict)
+    small_displacement_error: dict[str, SmallDisplacementError] = field(default_factory=dict)
     small_displacement_tolerance: float = np.inf
     deformation: dict[str, float] = field(default_factory=dict)
     ejected_bodies: dict[str, tuple[float, float, float]] = field(default_factory=dict)

@@ -8,7 +8,7 @@ import numpy as np
 
 from fenics_contact.arguments import check_bool
 from fenics_contact.checks.cross_check import CrossCheck
-from fenics_contact.checks.kinematics import Respond, linearisation
+from fenics_contact.checks.kinematics import TangentSolve, estimate_small_displacement_error
 from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.quadrature_resolution import warn_of_divided_facets, warn_of_few_points
 from fenics_contact.checks.tunnelling import TunnellingCheck
@@ -66,7 +66,7 @@ class Verifier:
         start: InitialForces,
         rtol: float,
         began: Array | None,
-        respond: Respond | None = None,
+        respond: TangentSolve | None = None,
     ) -> tuple[Verdict, Forces]:
         """Recompute residual, balance and laws at evaluated contacts. Collective.
 
@@ -117,7 +117,9 @@ class Verifier:
             obstacles={c.name: ObstacleCheck.of(c) for c in self._contacts if laws and c.rigid},
             tunnelling=tunnelling,
             small_displacement_error=(
-                linearisation(self._contacts, self._full.scales, respond) if respond else {}
+                estimate_small_displacement_error(self._contacts, self._full.scales, respond)
+                if respond
+                else {}
             ),
             small_displacement_tolerance=self.small_displacement_tolerance,
             deformation=self._deformation(),
