@@ -77,7 +77,7 @@ def hidden_by_round_off(verdict: Verdict) -> list[str]:
     return [
         f"the forces on {name} have a residual {balance.round_off_in_words}"
         for name, balance in verdict.equations.items()
-        if balance.holds(2.0) and balance.hides_balance
+        if balance.holds(2.0) and balance.is_below_round_off
     ]
 
 

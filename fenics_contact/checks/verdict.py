@@ -19,22 +19,21 @@ from fenics_contact.wording import percent
 
 __all__ = ["ForceBalance", "Verdict", "check_laws"]
 
-# The laws hold point by point up to rounding of their few operations.
+# Relative violation of the contact laws, which hold at every point up to round-off.
 _LAW_TOLERANCE = 1e-10
-# Round-off as a share of a place or a traction, in units of that tolerance.
-_ROUND_OFF = 16 * np.finfo(float).eps / _LAW_TOLERANCE
-# Share of the energy exchanged that friction may seem to give: by the mean of the tractions at both
-# ends it does so where slip turns round within a long increment (6 % where a load aside is
-# reversed at once); in a state that smaller increments do not lead to it is half or more.
+# Round-off of coordinates and tractions relative to their magnitude, divided by that tolerance.
+_SCALED_ROUND_OFF_RATIO = 16 * np.finfo(float).eps / _LAW_TOLERANCE
+# Energy supplied by friction relative to the energy exchanged. It is 6 % by the mean of the
+# tractions at both ends if a tangential load is reversed in one increment, and half or more in
+# states that smaller increments do not lead to.
 _MAX_FRICTION_ENERGY_GAIN = 0.25
-# A displacement by the size of the body, rigid motion apart, that no body with stiffness has: half
-# of what its ends move apart.
-_MOST_DEFORMED = 5.0
+# Displacement without rigid-body motion, half of the relative one of the ends, by the body's size.
+_MAX_DEFORMATION_RATIO = 5.0
 
 
 @dataclass(frozen=True)
 class ForceBalance:
-    """The residual of forces in balance, with the forces and the tolerance it is compared with.
+    """The residual of an equilibrium, with the magnitude of its forces and its tolerance.
 
     Attributes:
         residual: Norm of the residual (force).
@@ -50,7 +49,7 @@ class ForceBalance:
 
     @property
     def is_loaded(self) -> bool:
-        """Whether there are forces, that is, more than the residual accepted."""
+        """Whether the forces exceed the tolerance of the residual."""
         return self.force > self.tolerance
 
     @property
@@ -59,33 +58,33 @@ class ForceBalance:
         return bool(np.isfinite([self.residual, self.force, self.tolerance]).all())
 
     def holds(self, times: float = 1.0) -> bool:
-        """Return whether all is finite and the residual at most ``times`` the tolerance."""
+        """Return whether the residual is finite and at most ``times`` the tolerance."""
         return self.is_finite and self.residual <= times * self.tolerance
 
     def condition(self, name: str, failure: str, times: float = 1.0) -> Condition:
-        """Return the condition that `holds` looks at."""
+        """Return the condition that the residual is at most ``times`` the tolerance."""
         residual = self.residual if self.is_finite else np.nan
         return Condition(name, residual, times * self.tolerance, failure)
 
     def excess(self) -> float:
-        """Return the residual divided by the tolerance; infinite if something is not finite."""
+        """Return the residual divided by the tolerance; infinite if a number is not finite."""
         if self.is_finite and self.residual == 0.0:
             return 0.0
         return self.residual / self.tolerance if self.is_finite and self.tolerance > 0.0 else np.inf
 
     def __str__(self) -> str:
         """Return residual, tolerance and forces in words."""
-        found = f"{self.residual:.3e} above {self.tolerance:.3e}, of forces of {self.force:.3e}"
-        return found + (f", {self.round_off_in_words}" if self.hides_balance else "")
+        text = f"{self.residual:.3e} above {self.tolerance:.3e}, of forces of {self.force:.3e}"
+        return text + (f", {self.round_off_in_words}" if self.is_below_round_off else "")
 
     @property
-    def hides_balance(self) -> bool:
-        """Whether the round-off of the internal forces is above the tolerance."""
+    def is_below_round_off(self) -> bool:
+        """Whether the tolerance is below the round-off of the internal forces."""
         return self.round_off > self.tolerance
 
     @property
     def round_off_in_words(self) -> str:
-        """The round-off, and where it comes from, in words."""
+        """The round-off and its cause in words."""
         return (
             f"with a round-off of {self.round_off:.3e}: its stiffness, or its rigid-body "
             "displacement, is too large relative to the forces"
@@ -99,21 +98,21 @@ class Verdict:
     `failures` is empty for a verified solution.
 
     Attributes:
-        equations: By body, free obstacle and contact, the residual of the free dofs, recomputed by
-            assembly, with the forces of the present increment and the tolerance.
+        equations: By body, free obstacle and contact, the residual of the free dofs, assembled
+            again, with the forces of the present increment and the tolerance.
         sums: By body, the resultant of loads, contact tractions and reactions, and their moment
             about the centre of the body divided by its size (force). Contact enters by the
             tractions at the quadrature points, not by nodal forces.
         laws: By contact and condition, the largest relative violation of the contact law.
         enforcement: By contact with multipliers, its `Contact.enforcement_error`.
-        enforcement_tolerance: By contact with multipliers, the largest such error accepted.
+        enforcement_tolerance: By contact with multipliers, the largest enforcement error accepted.
         obstacles: By contact with a rigid obstacle, distance gradient, depth and rotation.
         tunnelling: By contact, the penetration between the quadrature points, and the points that
             have crossed the obstacle.
         small_displacement_error: By contact, the relative error due to the small-displacement
             assumption.
-        small_displacement_tolerance: Largest such error accepted. If it is finite, no body may
-            deform by more than five times its size.
+        small_displacement_tolerance: Largest small-displacement error accepted. If it is finite, no
+            body may deform by more than five times its size.
         deformation: By body, the largest displacement without rigid-body motion, divided by the
             size of the body or the range of its Dirichlet values, whichever is larger.
         ejected_bodies: By body without contact force that is ejected its displacement, the largest
@@ -150,12 +149,12 @@ class Verdict:
 
     @property
     def worst_equation(self) -> ForceBalance:
-        """The one of `equations` with the largest residual relative to its tolerance."""
+        """The equation with the largest residual relative to its tolerance."""
         return max(self.equations.values(), key=ForceBalance.excess)
 
     @property
     def worst_sum(self) -> ForceBalance:
-        """The one of `sums` with the largest residual relative to its tolerance."""
+        """The sum of forces with the largest residual relative to its tolerance."""
         return max(self.sums.values(), key=ForceBalance.excess)
 
     @property
@@ -191,7 +190,7 @@ class Verdict:
 
     @property
     def pairing_errors(self) -> list[str]:
-        """Contacts whose small-displacement error may be that of their pairs."""
+        """Contacts whose small-displacement error may be due to their pairs."""
         errors, tolerance = self.small_displacement_error, self.small_displacement_tolerance
         return [name for name, error in errors.items() if error.is_due_to_pairs(tolerance)]
 
@@ -203,19 +202,19 @@ class Verdict:
     @property
     def conditions(self) -> list[Condition]:
         """All conditions of the verification."""
-        # Twice: the solver's residual is a product with K, this one an assembly.
-        found = [
+        # Twice the tolerance: the solver's residual is a product with K, this one is assembled.
+        conditions = [
             balance.condition(f"equations, {name}", f"residual of {name} is {balance}", 2.0)
             for name, balance in self.equations.items()
         ]
-        found += [
+        conditions += [
             balance.condition(
                 f"sums of forces, {name}",
                 f"forces on {name}, or their moments, do not balance: {balance}",
             )
             for name, balance in self.sums.items()
         ]
-        found += [
+        conditions += [
             balance.condition(
                 f"cross-check, {contact}",
                 f"{contact}: the contact forces differ from those that DOLFINx assembles from the "
@@ -223,7 +222,7 @@ class Verdict:
             )
             for contact, balance in self.cross_check.items()
         ]
-        found += self._conditions_of_laws()
+        conditions += self._conditions_of_laws()
         for contact, error in self.enforcement.items():
             allowed = self.enforcement_tolerance[contact]
             failure = (
@@ -233,47 +232,49 @@ class Verdict:
                 "node of Γc inside of the obstacle, its penetration remains: take such facets out "
                 "of Γc"
             )
-            found.append(Condition(f"enforcement, {contact}", error, allowed, failure))
+            conditions.append(Condition(f"enforcement, {contact}", error, allowed, failure))
+        gain, limit = self.friction_energy_gain, _MAX_FRICTION_ENERGY_GAIN
         failure = (
-            f"friction supplies energy, {percent(self.friction_energy_gain)} of the energy "
+            f"friction supplies energy, {percent(gain)} of the energy "
             "exchanged: the equations have several solutions, and this one is not reached by a "
             "continuous load path. Use smaller increments (increments() halves them where needed)"
         )
-        gain, limit = self.friction_energy_gain, _MAX_FRICTION_ENERGY_GAIN
-        found.append(Condition("energy supplied by friction", gain, limit, failure))
+        conditions.append(Condition("energy supplied by friction", gain, limit, failure))
         tolerance = self.small_displacement_tolerance
         for contact, change in self.small_displacement_error.items():
-            found += change.conditions(contact, tolerance)
+            conditions += change.conditions(contact, tolerance)
         for name, deformation in self.deformation.items() if tolerance < np.inf else ():
             failure = (
                 f"{name} is deformed by {deformation:.2g} times its size: a part of it is not "
                 "constrained, or the units of stiffness, loads and lengths are not consistent; or "
                 "accept it: ContactProblem(small_displacement_tolerance=inf)"
             )
-            value = float(np.nan_to_num(deformation))  # a NaN is a failure of the equations
-            found.append(Condition(f"deformation, {name}", value, _MOST_DEFORMED, failure))
-        for name, (way, limit, others) in self.ejected_bodies.items():
+            value = float(np.nan_to_num(deformation))  # for a NaN the equations fail
+            conditions.append(
+                Condition(f"deformation, {name}", value, _MAX_DEFORMATION_RATIO, failure)
+            )
+        for name, (displacement, limit, others) in self.ejected_bodies.items():
             failure = (
-                f"{name} is ejected: it has moved by {way:.2g} and has no contact force, while "
-                f"nothing near has moved, deformed, or pushed it, by more than {others:.2g}. Use "
-                "smaller increments "
+                f"{name} is ejected: it has moved by {displacement:.2g} and has no contact force, "
+                f"while no displacement nearby exceeds {others:.2g}. Use smaller increments "
                 "(increments() halves them where needed), start with the bodies in contact, or "
                 "constrain it by a weak spring"
             )
-            found.append(Condition(f"displacement without force, {name}", way, limit, failure))
+            condition = f"displacement without force, {name}"
+            conditions.append(Condition(condition, displacement, limit, failure))
         failure = (
             "cells are inverted, det(I + grad u) ≤ 0. Use smaller increments (increments() halves "
             "them where needed), or refine the mesh there"
         )
-        found.append(Condition("inverted cells", float(self.inverted), 0.0, failure))
+        conditions.append(Condition("inverted cells", float(self.inverted), 0.0, failure))
         for contact, obstacle in self.obstacles.items():
-            found += obstacle.conditions(contact)
+            conditions += obstacle.conditions(contact)
         for contact, tunnelling in self.tunnelling.items():
-            found += tunnelling.conditions(contact)
-        return found
+            conditions += tunnelling.conditions(contact)
+        return conditions
 
     def _conditions_of_laws(self) -> list[Condition]:
-        """Those of the contact laws."""
+        """Return the conditions of the contact laws."""
         return [
             Condition(
                 f"{law}, {contact}",
@@ -292,22 +293,22 @@ def check_laws(contact: Contact) -> dict[str, float]:
     Collective. The contact is evaluated.
 
     Returns:
-        The largest violation of each condition, relative to the largest value concerned; NaN if
-        something is not finite. The scale is at least the round-off of the coordinates (16 eps
+        The largest violation of each condition, relative to the largest of its terms; NaN if a term
+        is not finite. The scale is at least the round-off of the coordinates (16 eps
         times the size of the mesh) divided by the tolerance, so that residual displacements and
         tractions below round-off do not count. The conditions are
 
         - "complementarity", eq. (6): s - u_n = δ₊ - δ₋, r_n ≤ 0 and r_n = -k_n δ₋; with multipliers
           r_n = -k_n (u_n - s) - λ_n where that is negative; with a `normal_potential` of the law,
           r_n is minus its derivative by u_n;
-        - "stiffness" instead if the law bears tension, r_n = -k_n (u_n - s); with tangential
+        - "stiffness" instead if the law has tension, r_n = -k_n (u_n - s); with tangential
           tractions but no friction also τ = -K_t u_t, or τ = 0 where open;
         - with friction, "friction bound": it is `Law.friction_bound` at the pressure; "cone":
           g_j ≤ 0 for the law's yield functions; "slip": Δβ ≥ 0 and
           Δτ = -K_t (Δu_t + Σ Δβ_j ∂g_j/∂τ) [44]; "dissipation": Δβ_j g_j = 0, slip against τ.
     """
     comm = contact.surface.mesh.comm
-    # Points without an opposite bear nothing, whatever they do.
+    # Points without a pair have no traction.
     law, paired, v = contact.law, contact.paired, contact.values
     if not paired.all():
         v = v.at(paired)
@@ -320,14 +321,14 @@ def check_laws(contact: Contact) -> dict[str, float]:
         return value / scale if scale > 0 or not np.isfinite(scale) else value
 
     x = contact.surface.mesh.geometry.x
-    nowhere = np.full(1, _ROUND_OFF * (global_max(comm, x) - global_min(comm, x)))
-    r_n, gap, length = v.normal_traction, v.gap, (v.initial_gap, v.normal_displacement, nowhere)
+    round_off = np.full(1, _SCALED_ROUND_OFF_RATIO * (global_max(comm, x) - global_min(comm, x)))
+    r_n, gap, length = v.normal_traction, v.gap, (v.initial_gap, v.normal_displacement, round_off)
     violations = [relative(worst(v.initial_gap - v.normal_displacement - gap), gap, *length)]
-    acting = np.where(r_n != 0, v.normal_stiffness, 0.0)  # where none acts it may be infinite
-    pressure = (r_n, nowhere * acting)
+    stiffness = np.where(r_n != 0, v.normal_stiffness, 0.0)  # without traction it may be infinite
+    pressure = (r_n, round_off * stiffness)
     if law.has_own_normal:
-        pull = np.maximum(r_n, 0) if not law.has_tension else np.zeros_like(r_n)
-        violations.append(relative(worst(pull, r_n - v.normal_reaction), *pressure))
+        tension = np.maximum(r_n, 0) if not law.has_tension else np.zeros_like(r_n)
+        violations.append(relative(worst(tension, r_n - v.normal_reaction), *pressure))
     elif law.has_tension:
         elastic = v.parameters["k_n"] * (v.normal_displacement - v.initial_gap)
         violations.append(relative(worst(r_n + elastic), *pressure))
@@ -338,9 +339,9 @@ def check_laws(contact: Contact) -> dict[str, float]:
         elastic = v.parameters["k_n"] * v.penetration
         violations.append(relative(worst(np.maximum(r_n, 0), r_n + elastic), *pressure))
     violations.append(relative(worst(contact.traction[~paired]), contact.traction))
-    found = {"stiffness" if law.has_tension else "complementarity": max(violations)}
+    errors = {"stiffness" if law.has_tension else "complementarity": max(violations)}
     if not law.has_tangential:
-        return found
+        return errors
 
     tau, stiffness = v.traction, contact.tangential_stiffness[paired]
     stiffest = np.linalg.norm(stiffness, axis=(1, 2))
@@ -348,30 +349,30 @@ def check_laws(contact: Contact) -> dict[str, float]:
         elastic = np.einsum("qij,qj->qi", stiffness, contact.tangential_displacement[paired])
         if not law.has_tension:
             elastic[v.penetration <= 0] = 0.0
-        violation = relative(worst(tau + elastic), tau, nowhere * stiffest)
-        found["stiffness"] = max(found.get("stiffness", 0.0), violation)
-        return found
+        violation = relative(worst(tau + elastic), tau, round_off * stiffest)
+        errors["stiffness"] = max(errors.get("stiffness", 0.0), violation)
+        return errors
 
     bound, beta = v.friction_bound, v.slip_increment
     contact.contact_kinematics.update()
     functions, gradients = (rows[paired] for rows in contact.effective_law.own.evaluate_yield())
     missing = contact.slip_vector()[paired]  # = -Σ Δβ_j ∂g_j/∂τ (44)
     change = missing - v.increment
-    # An open point keeps no traction and counts no slip, whatever it moves.
-    bears = bound > 0
-    slipped = -np.einsum("qm,qmd->qd", beta, gradients)
-    # Round-off of the traction is one of the slip by the springs, large where these are soft; that
-    # of the increments is by the displacements which they are differences of.
-    borne = np.linalg.norm(tau, axis=1)
-    yields = np.divide(borne, stiffest, out=np.zeros_like(borne), where=stiffest > 0)
-    travel = (v.jump, v.increment, change, nowhere, _ROUND_OFF * yields)
-    found["cone"] = relative(worst(np.maximum(functions, 0)), bound)
-    # Where nothing presses a law may bound friction by zero, whatever its bound without pressure.
-    apart = np.where((r_n < 0) | (bound != 0.0), bound - v.bound_of_law, 0.0)
-    found["friction bound"] = relative(worst(apart), bound)
-    found["slip"] = relative(worst(np.minimum(beta, 0), (missing - slipped)[bears]), *travel)
-    found["dissipation"] = relative(
-        worst((beta * functions)[bears], np.maximum(np.sum(tau * missing, axis=1) * bears, 0)),
+    # Open points have neither traction nor slip.
+    closed = bound > 0
+    slip = -np.einsum("qm,qmd->qd", beta, gradients)
+    # The round-off of the slip is that of the displacements, and that of the traction divided by
+    # the stiffness.
+    size = np.linalg.norm(tau, axis=1)
+    elastic = np.divide(size, stiffest, out=np.zeros_like(size), where=stiffest > 0)
+    travel = (v.jump, v.increment, change, round_off, _SCALED_ROUND_OFF_RATIO * elastic)
+    errors["cone"] = relative(worst(np.maximum(functions, 0)), bound)
+    # Without pressure the bound may be zero instead of that of the law.
+    difference = np.where((r_n < 0) | (bound != 0.0), bound - v.bound_of_law, 0.0)
+    errors["friction bound"] = relative(worst(difference), bound)
+    errors["slip"] = relative(worst(np.minimum(beta, 0), (missing - slip)[closed]), *travel)
+    errors["dissipation"] = relative(
+        worst((beta * functions)[closed], np.maximum(np.sum(tau * missing, axis=1) * closed, 0)),
         np.array([worst(bound) * worst(*travel)]),
     )
-    return found
+    return errors

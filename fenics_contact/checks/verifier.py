@@ -26,18 +26,18 @@ from fenics_contact.wording import percent
 
 __all__ = ["Verifier"]
 
-# Growth of what small displacements leave out from which on it is said again.
-_AGAIN = 2.0
+# Growth of the small-displacement error after which the warning is repeated.
+_REPEATED_WARNING_FACTOR = 2.0
 
 
 class Verifier:
-    """Looks at evaluated states of a problem.
+    """Verifies evaluated states of a problem.
 
     Attributes:
-        small_displacement_tolerance: As for `ContactProblem`.
+        small_displacement_tolerance: Largest relative error accepted of forces and pressures.
 
     Raises:
-        ValueError: ``cross_check`` is no bool.
+        ValueError: ``cross_check`` is not a bool.
     """
 
     def __init__(
@@ -50,9 +50,9 @@ class Verifier:
         self._contacts, self._comm = full.contacts, full.unknowns.comm
         self._obstacles = TunnellingCheck([c for c in full.contacts if c.rigid])
         self._bodies = TunnellingCheck([c for c in full.contacts if not c.rigid])
-        self._warned: dict[str, float] = {}
-        self._inexact: set[str] = set()
-        self._few: set[tuple[str, str]] = set()
+        self._warned_errors: dict[str, float] = {}
+        self._warned_round_off: set[str] = set()
+        self._warned_resolution: set[tuple[str, str]] = set()
         products = np.array([motions.by_body(full, motion) for motion in motions.of_bodies])
         products = np.moveaxis(products, 0, 2)
         # A body of one node has no rotations.
@@ -71,17 +71,17 @@ class Verifier:
         """Recompute residual, balance and laws at evaluated contacts. Collective.
 
         Args:
-            system: The unknowns on which the residual is looked at.
-            bulk: Residual of the bulk on these.
+            system: The unknowns of the residual.
+            bulk: Residual of the bulk on these (force).
             start: Forces at the beginning of the increment.
-            rtol: Residual that passes, as a share of the forces.
-            began: The state in which the increment began; None: laws, rigid obstacles and paths are
-                not judged, and tractions are those evaluated last, whatever has become of the
-                laws' data since.
-            respond: To look at what small displacements leave out; None: it is not looked at.
+            rtol: Residual accepted, relative to the forces.
+            began: The unknowns at the beginning of the increment; None: laws, rigid obstacles and
+                paths are not verified, and tractions are those evaluated last.
+            respond: Solves with the tangent for the small-displacement error; None: the error is
+                not estimated.
 
         Returns:
-            The verdict, and the forces at the unknowns, reactions included.
+            The verdict, and the forces at the unknowns, with reactions.
         """
         laws = began is not None
         contacts = system.contact_forces(evaluated=not laws)
@@ -94,12 +94,12 @@ class Verifier:
         augmented = [c for c in self._contacts if c.multipliers is not None and laws]
         rows = norms.residual, norms.force, tolerance, norms.round_off
         equations = zip(names, *rows, strict=True)
-        # Neither forces nor moments are judged by the axes.
+        # The norms of forces and of moments do not depend on the axes.
         parts = np.split(imbalance, [self._full.gdim], axis=1)
         unbalanced = np.max([np.linalg.norm(part, axis=1) for part in parts], axis=0)
         sums = zip(names, unbalanced, sizes[1], allowed, strict=False)
         complete = system is self._full
-        # Of the opposite only what Γc meets is known before u is complete; of rigid obstacles all.
+        # Opposing bodies are known on the retained dofs only, unless u is complete.
         before, tunnelling, ejected = None, {}, {}
         if began is not None:
             before = self._full.displacement_at(began)
@@ -130,71 +130,68 @@ class Verifier:
         return verdict, system.forces(bulk, reaction)
 
     def warn_of_large_motion(self, verdict: Verdict) -> None:
-        """Say that displacements are not small, and again where twice as much. Collective."""
-        for name, found in verdict.small_displacement_error.items():
-            if found.is_notable and found.worst > _AGAIN * self._warned.get(name, 0.0):
-                self._warned[name] = found.worst
+        """Warn of a small-displacement error, and again if it has doubled. Collective."""
+        for name, error in verdict.small_displacement_error.items():
+            threshold = _REPEATED_WARNING_FACTOR * self._warned_errors.get(name, 0.0)
+            if error.is_notable and error.worst > threshold:
+                self._warned_errors[name] = error.worst
                 warn(
                     self._comm,
                     f"{name}: displacements are assumed small, with gap and normals of the "
-                    f"undeformed body; at the deformed position {found.describe()}. With large "
+                    f"undeformed body; at the deformed position {error.describe()}. With large "
                     'displacements use Contact(kinematics="finite")',
                 )
 
     def warn_of_round_off(self, verdict: Verdict) -> None:
-        """Say once of every body whose forces are less exact than those of contact. Collective."""
-        for name, share in verdict.inexact.items():
-            if name not in self._inexact:
-                self._inexact.add(name)
+        """Warn once of every body with a large round-off of its forces. Collective."""
+        for name, residual in verdict.inexact.items():
+            if name not in self._warned_round_off:
+                self._warned_round_off.add(name)
                 warn(
                     self._comm,
                     f"{name}: round-off of its displacements leaves a residual of "
-                    f"{percent(share)} of the forces on it, the possible error of its stresses "
+                    f"{percent(residual)} of the forces on it, the possible error of its stresses "
                     "and reactions; contact forces are as accurate as on the softer bodies in "
                     "contact with it. A smaller stiffness of this body reduces it",
                 )
 
     def warn_of_few_points(self) -> None:
-        """Say once of every contact where points are too few for where it is. Collective."""
+        """Warn once of every contact with too few quadrature points. Collective."""
         for contact in self._contacts:
-            for say in (warn_of_few_points, warn_of_divided_facets):
-                told = contact.name, say.__name__
-                if told not in self._few and say(contact):
-                    self._few.add(told)
+            for warn_of in (warn_of_few_points, warn_of_divided_facets):
+                key = contact.name, warn_of.__name__
+                if key not in self._warned_resolution and warn_of(contact):
+                    self._warned_resolution.add(key)
 
     def _deformation(self) -> dict[str, float]:
-        """Largest displacement of every body but for its rigid motion, by its size. Collective.
-
-        By what is prescribed, where Dirichlet values of the body differ by more than its size.
-        """
+        """Return the `Verdict.deformation` of every body. Collective."""
         full, scales, motions = self._full, self._full.scales, self._motions
         state = full.state()
         sums = global_sum(self._comm, motions.by_body(full, state))
         rigid = np.einsum("bmn,bn->bm", self._inverse, sums)
-        rest = scales.largest(state - motions.field(rigid))
+        deformation = scales.largest(state - motions.field(rigid))
         spread: Array = np.zeros(len(rigid))
-        for along in motions.of_bodies[: full.gdim]:
-            held = (along != 0.0) & full.constrained
-            spread = np.maximum(spread, scales.spread(state, held))
-        found = rest / np.maximum(scales.size, spread)
-        return dict(zip(full.parts.names, found.tolist(), strict=False))
+        for translation in motions.of_bodies[: full.gdim]:
+            prescribed = (translation != 0.0) & full.constrained
+            spread = np.maximum(spread, scales.spread(state, prescribed))
+        ratios = deformation / np.maximum(scales.size, spread)
+        return dict(zip(full.parts.names, ratios.tolist(), strict=False))
 
     def _force_sums(
         self, system: System, internal: Array, forces: Sequence[Array]
     ) -> tuple[Array, Array]:
-        """What does not cancel of ∑F(u) - reactions - ∫ (r_n n + τ) on every body. Collective.
+        """Sum forces and moments ∑F(u) - reactions - ∫ (r_n n + τ) by body. Collective.
 
-        Moments, too. The last is the contacts' own sum over their points, not that of their nodal
-        forces.
+        The integral is the sum over the quadrature points, not over nodal forces.
 
         Args:
             system: The unknowns.
             internal: Residual of the bulk without reactions, (n_local,).
-            forces: What tells how large all forces are, (n_local,) each.
+            forces: All forces, for their magnitude, (n_local,) each.
 
         Returns:
-            The sums, (n_bodies, n_per_body) (force), see `RigidBodyModes.work`; of every body the
-            number of its unknowns, and the sum of the absolute forces, (2, n_bodies).
+            The sums, (n_bodies, n_per_body) (force), as of `RigidBodyModes.work`; the number of
+            unknowns and the sum of absolute forces of every body, (2, n_bodies).
         """
         total = self._motions.by_body(system, internal)
         n = len(total)
@@ -204,7 +201,7 @@ class Verifier:
         count = np.bincount(system.label, minlength=n)[:n]
         sizes = [np.bincount(system.label, np.abs(f), minlength=n)[:n] for f in forces]
         sums = global_sum(self._comm, np.stack([*total.T, count, np.sum(sizes, axis=0)]))
-        # What cannot be told is left out; a force that is no number is seen by the translations.
+        # Moments that are NaN are omitted: a NaN force is found in the translations.
         rotations = sums[self._full.gdim : -2]
         rotations[np.isnan(rotations)] = 0.0
         return sums[:-2].T, sums[-2:]
