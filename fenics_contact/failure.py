@@ -1,4 +1,4 @@
-"""The error of an increment without a verified solution, and what to try."""
+"""The error of an increment without a verified solution, with advice."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class NotConverged(RuntimeError):
         attempts: The attempts, in their order.
         prefix: Prefix of the problem's PETSc options.
         stiffnesses: Names of the stiffness parameters that may be lowered, the first one first.
-        driven: Whether a force drives an obstacle.
+        driven: Whether a force acts on an obstacle.
 
     Attributes:
         increment: Number of the increment, from 1.
@@ -47,7 +47,7 @@ class NotConverged(RuntimeError):
         self.iterations = sum(attempt.iterations for attempt in attempts)
         self._remarks: list[str] = []
         failures = [*verdict.failures, *hidden_by_round_off(verdict)]
-        what = "; ".join(failures) or "the last state passes the verification"
+        failed = "; ".join(failures) or "the last state passes the verification"
         tried = ". ".join(str(attempt) for attempt in attempts)
         super().__init__(
             (
@@ -57,7 +57,7 @@ class NotConverged(RuntimeError):
                 else f"increment {increment} did not converge: SNES reason {reason} after "
                 f"{self.iterations} iterations; "
             )
-            + f"{what}; the forces have magnitude {verdict.worst_equation.force:.3e}. "
+            + f"{failed}; the forces have magnitude {verdict.worst_equation.force:.3e}. "
             + f"Tried: {tried}. "
             + _advice(reason, verdict, attempts, stiffnesses, driven=driven)
             + f"; -{prefix}snes_monitor shows the iterations"
@@ -73,7 +73,7 @@ class NotConverged(RuntimeError):
 
 
 def hidden_by_round_off(verdict: Verdict) -> list[str]:
-    """What passes, and may be why the rest does not: round-off hides the equilibrium of a body."""
+    """Return the equilibria whose tolerance is below round-off, as possible causes, in words."""
     return [
         f"the forces on {name} have a residual {balance.round_off_in_words}"
         for name, balance in verdict.equations.items()
@@ -81,22 +81,22 @@ def hidden_by_round_off(verdict: Verdict) -> list[str]:
     ]
 
 
-# How `Overload.in_words` begins; smaller increments do not help.
+# First word of `Overload.in_words`.
 _OVERLOAD = "overload:"
-_OF_A_LAW = (
+_ADVICE_LAW = (
     "The equations hold, but the contact law does not: check that contact_traction, friction_bound "
     "and normal_potential of a user-defined law are consistent"
 )
-_OF_A_STATE_NOT_FINITE = (
+_ADVICE_NOT_FINITE = (
     "The last state is not finite (NaN or inf): tractions and their derivatives of a user-defined "
     "law must be finite at every gap and slip; a root, or a power below 1, has no derivative at 0. "
     "Otherwise try smaller increments"
 )
-_OF_OVERLOAD = (
+_ADVICE_OVERLOAD = (
     "Try a smaller load, more friction, or a Dirichlet condition that constrains this motion"
 )
 
-_OF_A_FORCE = (
+_ADVICE_FORCE = (
     "prescribe the displacement of the obstacle instead of the force on it, which may have a "
     "maximum, as in a snap fit"
 )
@@ -110,15 +110,15 @@ def _advice(
     *,
     driven: bool,
 ) -> str:
-    """What to try, by what went wrong."""
+    """Return advice for the kind of failure."""
     if reason > 0 and verdict.only_laws_fail:
-        return _OF_A_LAW
+        return _ADVICE_LAW
     if attempts and attempts[-1].outcome.startswith(_OVERLOAD):
-        return _OF_OVERLOAD
-    if reason > 0:  # a lower stiffness would help the iteration, which has converged
+        return _ADVICE_OVERLOAD
+    if reason > 0:  # converged: a lower stiffness does not help
         return "Try what the failed checks say, or smaller increments"
     if not verdict.is_finite:
-        return _OF_A_STATE_NOT_FINITE
+        return _ADVICE_NOT_FINITE
     lower = [f"a lower {name}" for name in stiffnesses]
     tries = ", then ".join([", ".join(["smaller increments", *lower[:-1]]), *lower[-1:]])
-    return f"Try {tries}" + (f", or {_OF_A_FORCE}" if driven else "")
+    return f"Try {tries}" + (f", or {_ADVICE_FORCE}" if driven else "")

@@ -1,4 +1,4 @@
-"""The state of a problem: all that an increment starts from, and what it finds."""
+"""The committed state of a problem, and the trial state of an increment."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ __all__ = ["State", "Trial"]
 
 @dataclass(frozen=True)
 class State:
-    """A committed state, the whole history of a problem.
+    """A committed state with the history variables, from which an increment starts.
 
     Attributes:
         unknowns: This rank's displacements, then the unknown motions of obstacles (length).
         contacts: The state of every contact.
         load: External forces at the unknowns (force).
         energy: Forces and energies.
-        load_change: Of the external forces in the last increment (force).
-        change: Of the unknowns in the last increment (length); None: there was none, or the
-            interior was out of date.
-        interior: What recovers the interior displacement after static condensation; None if the
-            unknowns are up to date.
-        increment: Number of increments so far.
+        load_change: Change of the external forces in the last increment (force).
+        change: Change of the unknowns in the last increment (length); None before the first one, or
+            if the interior was out of date.
+        interior: Vector from which the interior displacement is recovered after static
+            condensation; None if the unknowns are complete.
+        increment: Number of committed increments.
     """
 
     unknowns: Array
@@ -40,7 +40,7 @@ class State:
 
 @dataclass(frozen=True)
 class Trial:
-    """A solved and verified state that is not committed; for the attributes see `State`."""
+    """A solved and verified state that is not committed, with the attributes of a `State`."""
 
     unknowns: Array
     contacts: tuple[ContactTrial, ...]

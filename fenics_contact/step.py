@@ -1,4 +1,4 @@
-"""The result of one increment, in numbers and in words."""
+"""The result of one increment and its summary."""
 
 from __future__ import annotations
 
@@ -60,41 +60,39 @@ class Step:
 
         For every contact, "force" is ∫ -r_n, "friction ∫|τ|" the integral of the magnitude, and
         "resultant" the force vector on the body. A contact whose forces do not exceed the tolerance
-        of the residual (`ForceBalance.is_loaded`) has "no contact force", and its numbers of points
-        are round-off. The error of the small-displacement assumption is stated from 1 % of force or
-        pressure on. The line states at its end if forces and areas are per unit thickness.
+        of the residual (`ForceBalance.is_loaded`) has "no contact force". Small-displacement errors
+        of force or pressure are stated from 1 % on.
         """
         parts = [f"increment {self.increment}"]
         if self.load is not None:
             parts.append(f"load {self.load:.6g}")
-        parts.append(self._made())
-        parts.append(self._residual())
+        parts.append(self._describe_solve())
+        parts.append(self._describe_residual())
         for name, r in self.contacts.items():
             if not self._is_loaded(name):
                 parts.append(f"{name}: no contact force")
                 continue
-            normal, friction, resultant = self._forces(name)
+            normal, friction, resultant = self._format_forces(name)
             parts.append(
                 f"{name}: force {normal}, friction ∫|τ| {friction}, resultant {resultant}, "
                 f"area {r.area:.4g}, {r.stick} stick {r.slip} slip {r.open} open"
             )
         per_thickness = ["forces and areas per unit thickness"] * self._per_thickness
-        return "; ".join([*parts, *self._left_out(), *per_thickness])
+        return "; ".join([*parts, *self._small_displacement_remarks(), *per_thickness])
 
-    def _left_out(self) -> list[str]:
-        """Return the small-displacement error of every contact in words, if it is notable."""
-        found = self.verdict.small_displacement_error.items()
+    def _small_displacement_remarks(self) -> list[str]:
+        """Return the notable small-displacement errors of the contacts in words."""
         return [
-            f"{name}: displacements are assumed small; otherwise {left_out.describe()}"
-            for name, left_out in found
-            if left_out.is_notable
+            f"{name}: displacements are assumed small; otherwise {error.describe()}"
+            for name, error in self.verdict.small_displacement_error.items()
+            if error.is_notable
         ]
 
     @property
     def _per_thickness(self) -> bool:
         return any(r.per_thickness for r in self.contacts.values())
 
-    def _residual(self) -> str:
+    def _describe_residual(self) -> str:
         if not self.verdict.is_loaded:
             return "no forces"
         return f"residual {self.verdict.relative_residual:.1e} of the forces"
@@ -102,14 +100,14 @@ class Step:
     def _is_loaded(self, contact: str) -> bool:
         return self.verdict.equations[contact].is_loaded
 
-    def _forces(self, contact: str) -> tuple[str, str, str]:
-        """Normal force, friction and resultant of a contact; 0 where it is not loaded."""
+    def _format_forces(self, contact: str) -> tuple[str, str, str]:
+        """Return normal force, friction and resultant of a contact; 0 if it is not loaded."""
         r = self.contacts[contact]
         loaded = float(self._is_loaded(contact))
         normal, friction = (f"{loaded * f:.6g}" for f in (r.normal_force, r.tangential_force))
-        return normal, friction, _components(loaded * r.force)
+        return normal, friction, _format_vector(loaded * r.force)
 
-    def _made(self) -> str:
+    def _describe_solve(self) -> str:
         """Return the method and the number of iterations in words."""
         if not self.iterations:
             return f"{self.method}: solved by the predictor"
@@ -124,18 +122,19 @@ class Step:
         rows = [
             (
                 name,
-                *self._forces(name),
+                *self._format_forces(name),
                 f"{r.area:.4g}",
                 *(str(n) if self._is_loaded(name) else "–" for n in (r.stick, r.slip, r.open)),
             )
             for name, r in self.contacts.items()
         ]
-        remarks = [f"{self._made()}; {self._residual()}", *self._left_out()]
+        solution = f"{self._describe_solve()}; {self._describe_residual()}"
+        remarks = [solution, *self._small_displacement_remarks()]
         remarks += ["Forces and areas are per unit thickness."] * self._per_thickness
         return html_table(title, (*header, "stick", "slip", "open"), rows, remarks)
 
 
-def _components(vector: Array) -> str:
-    """In words; what is next to nothing beside the length is 0."""
+def _format_vector(vector: Array) -> str:
+    """Format a vector, with components that are negligible relative to its length as 0."""
     size = np.linalg.norm(vector)
     return "(" + ", ".join(f"{v if abs(v) > NEGLIGIBLE * size else 0:.6g}" for v in vector) + ")"

@@ -1,4 +1,4 @@
-"""Types of arrays that all modules share."""
+"""Types of arrays and expressions."""
 
 from collections.abc import Mapping
 from typing import Any, TypeAlias
@@ -9,11 +9,9 @@ import ufl
 
 __all__ = ["Array", "Expr", "Index", "Indices", "Mask", "Values"]
 
-# Numbers at points, at unknowns, of coordinates.
 Array: TypeAlias = npt.NDArray[np.float64]
-# Which of them.
 Mask: TypeAlias = npt.NDArray[np.bool_]
-# Their numbers, as DOLFINx and PETSc have them, and as NumPy has.
+# Indices in DOLFINx and PETSc, and in NumPy.
 Indices: TypeAlias = npt.NDArray[np.int32]
 Index: TypeAlias = npt.NDArray[np.integer[Any]]
 Expr: TypeAlias = ufl.core.expr.Expr

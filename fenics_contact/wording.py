@@ -1,4 +1,4 @@
-"""Shares and places as messages say them, in any units."""
+"""Percentages and positions in messages."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy.typing as npt
 __all__ = ["percent", "place_in_words"]
 
 
-def percent(share: float) -> str:
-    """A share in per cent: two digits, or all before the point."""
-    return f"{100 * share:.2g} %" if abs(share) < 0.995 else f"{100 * share:.0f} %"
+def percent(ratio: float) -> str:
+    """Return a ratio in per cent, with two digits, or as an integer from 99.5 % on."""
+    return f"{100 * ratio:.2g} %" if abs(ratio) < 0.995 else f"{100 * ratio:.0f} %"
 
 
 def place_in_words(place: npt.ArrayLike) -> str:
-    """Coordinates to six digits of the largest, as a list."""
+    """Return coordinates as a list, rounded to six digits of the largest one."""
     x = np.asarray(place, dtype=np.float64)
     largest = np.abs(x).max(initial=0.0)
     digits = 5 - int(np.floor(np.log10(largest))) if 0.0 < largest < np.inf else 0

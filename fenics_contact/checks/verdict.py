@@ -324,8 +324,8 @@ def check_laws(contact: Contact) -> dict[str, float]:
     round_off = np.full(1, _SCALED_ROUND_OFF_RATIO * (global_max(comm, x) - global_min(comm, x)))
     r_n, gap, length = v.normal_traction, v.gap, (v.initial_gap, v.normal_displacement, round_off)
     violations = [relative(worst(v.initial_gap - v.normal_displacement - gap), gap, *length)]
-    stiffness = np.where(r_n != 0, v.normal_stiffness, 0.0)  # without traction it may be infinite
-    pressure = (r_n, round_off * stiffness)
+    k_n = np.where(r_n != 0, v.normal_stiffness, 0.0)  # may be infinite without traction
+    pressure = (r_n, round_off * k_n)
     if law.has_own_normal:
         tension = np.maximum(r_n, 0) if not law.has_tension else np.zeros_like(r_n)
         violations.append(relative(worst(tension, r_n - v.normal_reaction), *pressure))
@@ -364,8 +364,8 @@ def check_laws(contact: Contact) -> dict[str, float]:
     # The round-off of the slip is that of the displacements, and that of the traction divided by
     # the stiffness.
     size = np.linalg.norm(tau, axis=1)
-    elastic = np.divide(size, stiffest, out=np.zeros_like(size), where=stiffest > 0)
-    travel = (v.jump, v.increment, change, round_off, _SCALED_ROUND_OFF_RATIO * elastic)
+    elastic_slip = np.divide(size, stiffest, out=np.zeros_like(size), where=stiffest > 0)
+    travel = (v.jump, v.increment, change, round_off, _SCALED_ROUND_OFF_RATIO * elastic_slip)
     errors["cone"] = relative(worst(np.maximum(functions, 0)), bound)
     # Without pressure the bound may be zero instead of that of the law.
     difference = np.where((r_n < 0) | (bound != 0.0), bound - v.bound_of_law, 0.0)
