@@ -1,4 +1,4 @@
-"""One increment: the nonlinear equations solved from a committed state, and verified."""
+"""Solution and verification of one increment from a committed state."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ __all__ = ["Increment", "IncrementSolver", "Retry"]
 
 
 class Retry(Enum):
-    """Why an increment is solved again; the outcome of the last attempt, if there was one."""
+    """Reason to solve an increment again, and the outcome reported of its last attempt."""
 
     UNKNOWNS = "contact spreads beyond the retained dofs"
     PAIRS = "converged; opposite points updated, solved again"
@@ -47,33 +47,33 @@ class Increment:
     """An increment that is being solved.
 
     Attributes:
-        recover_interior: See `ContactProblem.solve`.
-        points: Between which points of bodies it is solved.
-        started: When it was begun, by `time.perf_counter`.
-        tried: What was tried.
+        recover_interior: Whether the interior displacement is recovered after static condensation.
+        points: The iteration for the opposite points of its pairs.
+        start_time: Start of the solution, by `time.perf_counter`.
+        attempts: All attempts in their order.
     """
 
     recover_interior: bool
     points: OppositePoints
-    started: float = field(default_factory=time.perf_counter)
-    tried: list[Attempt] = field(default_factory=list)
+    start_time: float = field(default_factory=time.perf_counter)
+    attempts: list[Attempt] = field(default_factory=list)
 
-    def ends(self, outcome: Retry) -> Retry:
-        """Let this be the outcome of the last attempt, and return it."""
-        self.tried[-1] = replace(self.tried[-1], outcome=outcome.value)
+    def set_outcome(self, outcome: Retry) -> Retry:
+        """Set the outcome of the last attempt and return it."""
+        self.attempts[-1] = replace(self.attempts[-1], outcome=outcome.value)
         return outcome
 
 
 @dataclass(frozen=True)
 class IncrementSolver:
-    """Solves increments of a problem. It changes u and the contacts, and no state.
+    """Solves increments of a problem. It changes u and the contacts, but no `State`.
 
     Attributes:
         full: The system on all unknowns.
-        solver: What solves it.
-        judge: What verifies a solution.
-        modulus: Young's modulus at Γc, as far as it follows the data of the bulk.
-        prefix: Of PETSc options, for messages.
+        solver: Solver of the nonlinear equations.
+        verifier: Verifies a solution.
+        modulus: Young's modulus at Γc, updated with the data of the bulk.
+        prefix: Prefix of the PETSc options, for messages.
     """
 
     full: FullSystem
@@ -82,10 +82,10 @@ class IncrementSolver:
     modulus: TrackedModulus
     prefix: str
 
-    # ---- what is given ---------------------------------------------------------------------------
+    # ---- input -----------------------------------------------------------------------------------
 
-    def _check_before(self, *, balance: bool) -> Array:
-        """Look at all that was given; the external forces (force). Collective.
+    def _check_input(self, *, balance: bool) -> Array:
+        """Check the data of the increment, and return its external forces (force). Collective.
 
         Args:
             balance: Whether to raise a ValueError for a load that contact cannot balance.
@@ -113,24 +113,25 @@ class IncrementSolver:
     def attempt(
         self, increment: Increment, state: State, present: State | Trial
     ) -> tuple[Trial, Step] | Retry:
-        """Solve an increment between its present pairs, on the unknowns retained. Collective.
+        """Solve an increment with its present pairs, on the retained dofs. Collective.
 
         Args:
             increment: The increment.
             state: The committed state.
-            present: The state that u is of.
+            present: The state of the present u.
 
         Returns:
-            The trial state and what is reported of it; or why to solve it again.
+            The trial state and its `Step`; or the reason to solve the increment again.
 
         Raises:
-            NotConverged, ValueError: See `ContactProblem.solve`.
+            NotConverged: No solution was found, or it failed the verification.
+            ValueError: Invalid input, or no contact force can balance the load.
         """
         solver, points = self.solver, increment.points
-        # Between points of its end a load that nothing balances is a failure of the increment.
-        load = self._check_before(balance=not points.replaced)
+        # With replaced pairs, a load without balance is a failure of the increment, not of input.
+        load = self._check_input(balance=not points.replaced)
         complete = present.interior is None and state.interior is None
-        if complete and points.contacts and not (increment.tried or points.replaced):
+        if complete and points.contacts and not (increment.attempts or points.replaced):
             self._predict_opposite_points(points, state, load)
         before = self.full.state()
         self.full.prescribe()
@@ -158,36 +159,37 @@ class IncrementSolver:
                 balance=not points.replaced,
                 fallback=not points.predicted,
             )
-        # Points outside of what is kept have to be looked at, and it takes all of u to do so.
-        lags = not (increment.recover_interior or solver.system.confined) and self._may_lag(state)
-        interior = solver.system.pending_field if lags else None
-        if not lags:
+        # Points outside of the retained dofs can only be verified with the interior displacement.
+        skips_recovery = not (increment.recover_interior or solver.system.confined)
+        skips_recovery = skips_recovery and self._can_skip_recovery(state)
+        interior = solver.system.pending_field if skips_recovery else None
+        if not skips_recovery:
             solver.system.complete(solver.system.pending_field)
         self.full.evaluate()
-        part = solver.system.part if lags else np.asarray
+        part = solver.system.part if skips_recovery else np.asarray
         if (
             reason > 0
             and move_unloaded_bodies(solver.equations, part)
             and solver.predictor.factored
         ):
             solver.predictor.store_converged_contacts()
-        increment.tried += attempts
+        increment.attempts += attempts
         if reason <= 0 and points.drop_prediction():
             return increment.ends(Retry.FROM_COMMITTED)
         if solver.needs_more_dofs(found=reason > 0):
             return increment.ends(Retry.UNKNOWNS)
-        if reason > 0 and (slid := points.to_update()):
-            return self._choose_pairs(increment, slid, interior)
-        kinematics = reason > 0  # a solver that failed may have no factors for it
-        if lags:
+        if reason > 0 and (outdated := points.to_update()):
+            return self._choose_pairs(increment, outdated, interior)
+        kinematics = reason > 0  # after a failure there may be no factors
+        if skips_recovery:
             verdict, energies = self._verify_retained(state.unknowns, kinematics=kinematics)
         else:
             assemble = increment.recover_interior or not solver.system.confined
             verdict, energies = self._verify_all(
                 state.unknowns, kinematics=kinematics, assemble=assemble
             )
-        if reason > 0 and (slid := points.to_update_for(verdict.pairing_errors)):
-            return self._choose_pairs(increment, slid, interior)
+        if reason > 0 and (outdated := points.to_update_for(verdict.pairing_errors)):
+            return self._choose_pairs(increment, outdated, interior)
         energy = None
         if reason > 0 and not verdict.failures:
             energy = self._energy(state, energies, points)
@@ -195,7 +197,7 @@ class IncrementSolver:
         if energy is None or verdict.failures:
             if points.drop_prediction():
                 return increment.ends(Retry.FROM_COMMITTED)
-            raise self._not_converged(state, reason, verdict, increment.tried)
+            raise self._not_converged(state, reason, verdict, increment.attempts)
         self.verifier.warn_of_large_motion(verdict)
         self.verifier.warn_of_round_off(verdict)
         self.verifier.warn_of_few_points()
@@ -207,25 +209,25 @@ class IncrementSolver:
         step = Step(
             increment=state.increment + 1,
             reason=reason,
-            iterations=sum(attempt.iterations for attempt in increment.tried),
+            iterations=sum(attempt.iterations for attempt in increment.attempts),
             augmentations=rounds,
-            method=increment.tried[-1].method,
+            method=increment.attempts[-1].method,
             factorisations=solver.equations.factorisations,
             verdict=verdict,
             contacts={c.name: c.resultants() for c in self.full.contacts},
             energy=energy,
-            attempts=tuple(increment.tried),
-            wall_seconds=time.perf_counter() - increment.started,
-            complete=not lags,
+            attempts=tuple(increment.attempts),
+            wall_seconds=time.perf_counter() - increment.start_time,
+            complete=not skips_recovery,
         )
         return trial, step
 
     def _predict_opposite_points(self, points: OppositePoints, state: State, load: Array) -> None:
-        """Find opposite points where the increment ends if it goes on as the last one. Collective.
+        """Find opposite points at the extrapolated end of the increment. Collective.
 
         Args:
-            points: The iteration for them.
-            state: The committed state, complete.
+            points: The iteration for the opposite points.
+            state: The committed state, with the interior displacement.
             load: External forces (force).
         """
         before = self.full.state()
@@ -238,36 +240,35 @@ class IncrementSolver:
     def _choose_pairs(
         self, increment: Increment, contacts: Sequence[Contact], interior: Array | None
     ) -> Retry:
-        """Choose where to find the pairs of contacts next, by where it has ended. Collective.
+        """Choose the states in which to find new pairs, from the end of the increment. Collective.
 
         Args:
             increment: The increment.
-            contacts: Contacts, evaluated there.
-            interior: What recovers the interior displacement there; None: u is up to date.
+            contacts: The contacts that need new pairs, evaluated.
+            interior: Vector from which the interior is recovered; None if u is complete.
         """
         if interior is not None:
             self.solver.system.complete(interior)
         increment.points.choose_states(contacts, self.full.state())
         return increment.ends(Retry.PAIRS)
 
-    def _may_lag(self, state: State) -> bool:
-        """Whether u can stay behind: energies and pairs must be found without it. Collective."""
+    def _can_skip_recovery(self, state: State) -> bool:
+        """Whether energies and pairs do not depend on the interior displacement. Collective."""
         contacts, comm = self.full.contacts, self.full.unknowns.comm
         if not (self.solver.condensed and self.full.bulk.symmetric):
             return False
         for contact in contacts:
-            # A body that has come to no pairs yet is looked for where it is.
-            alone = contact.contact_kinematics.can_update_pairs and not comm.allreduce(
+            # Pairs of a body without any are searched at its complete displacement.
+            unpaired = contact.contact_kinematics.can_update_pairs and not comm.allreduce(
                 int(contact.paired.any())
             )
-            if alone or contact.contact_kinematics.updates_pairs:
+            if unpaired or contact.contact_kinematics.updates_pairs:
                 return False
-        # Of nodes that the quadrature points do not carry only a complete u tells where they are.
-        carried = (
+        # The positions of nodes that the quadrature points do not determine need a complete u.
+        if not all(
             c.contact_kinematics.sampler is None or c.facet_places.points_carry_nodes
             for c in contacts
-        )
-        if not all(carried):
+        ):
             return False
         if self.solver.system.coordinate_id in state.energy.forces:
             return True
@@ -276,51 +277,51 @@ class IncrementSolver:
     def _not_converged(
         self, state: State, reason: int, verdict: Verdict, attempts: Sequence[Attempt]
     ) -> NotConverged:
-        told = {name for contact in self.full.contacts for name in contact.law.parameters()}
+        names = {name for contact in self.full.contacts for name in contact.law.parameters()}
         return NotConverged(
             state.increment + 1,
             reason,
             verdict,
             attempts,
             prefix=self.prefix,
-            stiffnesses=[name for name in ("k_t", "k_n") if name in told],
+            stiffnesses=[name for name in ("k_t", "k_n") if name in names],
             driven=any(m.force and not m.turns for c in self.full.contacts for m in c.motions),
         )
 
-    # ---- verifying -------------------------------------------------------------------------------
+    # ---- verification ----------------------------------------------------------------------------
 
     def _energy(self, state: State, energies: EnergyState, points: OppositePoints) -> Energy:
-        """The energies of the increment that has ended in a state. Collective."""
-        began, coordinate_id = state.energy, self.solver.system.coordinate_id
-        if self.full.coordinate_id not in energies.forces and coordinate_id not in began.forces:
-            # From rest, of the retained dofs alone.
-            nothing = Forces.none(np.zeros(1), np.zeros(1, dtype=np.intp))
-            began = began.with_forces(coordinate_id, nothing)
+        """Return the energies of the increment from a committed state. Collective."""
+        start, coordinate_id = state.energy, self.solver.system.coordinate_id
+        if self.full.coordinate_id not in energies.forces and coordinate_id not in start.forces:
+            # From rest, and on the retained dofs only: there are no forces at the start.
+            zero = Forces.none(np.zeros(1), np.zeros(1, dtype=np.intp))
+            start = start.with_forces(coordinate_id, zero)
         if points.replaced:
-            began = began.between(self.full.contacts)
-        return energies.since(began, self.full.contacts, self.full.scales)
+            start = start.between(self.full.contacts)
+        return energies.since(start, self.full.contacts, self.full.scales)
 
     def _verify_all(
         self, began: Array, *, kinematics: bool, assemble: bool
     ) -> tuple[Verdict, EnergyState]:
-        """Verifier a complete u by assembly, past SNES and its residual, or by K u. Collective."""
+        """Verify a complete u with the assembled residual of the bulk, or K u. Collective."""
         if assemble:
             bulk = self.full.with_obstacles(self.full.bulk.assemble_residual())
         else:
             bulk = self.full.product_force()
-        verdict, found = self.verify_system(self.full, bulk, began=began, kinematics=kinematics)
-        forces: dict[object, Forces] = {self.full.coordinate_id: found}
+        verdict, own = self.verify_system(self.full, bulk, began=began, kinematics=kinematics)
+        forces: dict[object, Forces] = {self.full.coordinate_id: own}
         if self.solver.condensed and self.full.bulk.symmetric:
             forces[self.solver.system.coordinate_id] = self.solver.system.present_forces()
         return verdict, EnergyState.at(forces, self.full.contacts)
 
     def _verify_retained(self, began: Array, *, kinematics: bool) -> tuple[Verdict, EnergyState]:
-        """Verifier the condensed equations; u stays behind. Collective."""
+        """Verify the condensed equations, without the interior displacement. Collective."""
         system = self.solver.system
-        verdict, found = self.verify_system(
+        verdict, forces = self.verify_system(
             system, system.bulk_force(), began=began, kinematics=kinematics
         )
-        return verdict, EnergyState.at({system.coordinate_id: found}, self.full.contacts)
+        return verdict, EnergyState.at({system.coordinate_id: forces}, self.full.contacts)
 
     def verify_system(
         self,
@@ -330,13 +331,14 @@ class IncrementSolver:
         began: Array | None = None,
         kinematics: bool = False,
     ) -> tuple[Verdict, Forces]:
-        """`Verifier.verifier` for the increment that was solved last. Collective.
+        """Verify the increment solved last by `Verifier.verify`. Collective.
 
         Args:
-            system: The unknowns on which the residual is looked at.
+            system: The unknowns of the residual.
             bulk: Residual of the bulk on these (force).
-            began: The state in which it began; None: see `Verifier.verifier`.
-            kinematics: Whether to look at what small displacements leave out.
+            began: The unknowns at the beginning of the increment; None: laws, rigid obstacles and
+                paths are not verified.
+            kinematics: Whether to estimate the small-displacement error.
         """
         equations = self.solver.equations
         return self.verifier.verify(

@@ -1,4 +1,4 @@
-"""ContactProblem: bodies in contact, their committed state, and the increment solved from it."""
+"""The contact problem: its committed state, and the solution of increments."""
 
 from __future__ import annotations
 
@@ -148,9 +148,9 @@ class ContactProblem:
             )
         self.contacts = listed("contacts", contacts, Contact)
         bcs = listed("bcs", bcs, fem.DirichletBC)
-        said = [c.accuracy for c in self.contacts if c.accuracy is not None]
-        all_say = bool(said) and len(said) == len(self.contacts)
-        self.accuracy = min(said, key=lambda a: a.error) if all_say else None
+        levels = [c.accuracy for c in self.contacts if c.accuracy is not None]
+        complete = bool(levels) and len(levels) == len(self.contacts)
+        self.accuracy = min(levels, key=lambda a: a.error) if complete else None
         settings = Settings(
             method=method,
             alpha=alpha,
@@ -182,29 +182,29 @@ class ContactProblem:
         self.initial_penetration = check_undeformed_geometry(self.contacts)
         find_free_modes(self.motions, self.full)
         self.full.scales.begin(self.full.operators)
-        judge = Verifier(self.full, self.motions, tolerance=tolerance, cross_check=cross_check)
+        verifier = Verifier(self.full, self.motions, tolerance=tolerance, cross_check=cross_check)
         self.solver = Solver(self.full, self.motions, settings)
-        self._increments = IncrementSolver(self.full, self.solver, judge, modulus, prefix)
+        self._increments = IncrementSolver(self.full, self.solver, verifier, modulus, prefix)
         self.full.evaluate()
         self.state = self._initial_state()
         self._trial: Trial | None = None
-        self._fresh = True  # nothing was solved yet
-        self._told = False  # of an increment that was not committed
+        self._is_first = True  # before the first solution
+        self._has_warned = False  # of an increment that was not committed
 
     def _initial_state(self) -> State:
-        """Return a body at rest, or the state that another problem has left. Collective."""
+        """Return the state of a body at rest, or that committed by another problem. Collective."""
         unknowns, coordinate_id = self.full.state(), self.full.coordinate_id
-        none = np.zeros_like(unknowns)
+        zero = np.zeros_like(unknowns)
         contacts = tuple(contact.states.committed for contact in self.contacts)
         if any(state.commits for state in contacts):
             load = self.full.present_load()
             self.full.begin(load)
             bulk = self.full.with_obstacles(self.full.bulk.assemble_residual())
             forces: dict[object, Forces] = {coordinate_id: self.full.present_forces(bulk)}
-            return State(unknowns, contacts, load, EnergyState.at(forces, self.contacts), none)
+            return State(unknowns, contacts, load, EnergyState.at(forces, self.contacts), zero)
         forces = {coordinate_id: Forces.none(unknowns, self.full.label)}
         energy = EnergyState.unloaded(forces, self.contacts)
-        return State(unknowns, contacts, none, energy, none)
+        return State(unknowns, contacts, zero, energy, zero)
 
     @property
     def increment(self) -> int:
@@ -213,7 +213,7 @@ class ContactProblem:
 
     @property
     def _present(self) -> State | Trial:
-        """The state that u is of: solved and not committed, or committed."""
+        """The state of u: the trial state if there is one, else the committed state."""
         return self._trial or self.state
 
     @property
@@ -253,10 +253,10 @@ class ContactProblem:
             raise ValueError(
                 f"expected_increments is {number!r}; it must be an integer, at least 1"
             )
-        if self._fresh:
+        if self._is_first:
             self.solver.expect(int(number))
 
-    # ---- the neighbourhood of a solution ---------------------------------------------------------
+    # ---- state and linearisation -----------------------------------------------------------------
 
     @property
     def increments_wanted(self) -> int:
@@ -322,76 +322,75 @@ class ContactProblem:
                 the load.
         """
         check_bool("recover_interior", recover_interior)
-        follows = self.small_displacement_tolerance < np.inf
-        points = OppositePoints(self.full, self.contacts if follows else [])
+        updates_pairs = self.small_displacement_tolerance < np.inf
+        points = OppositePoints(self.full, self.contacts if updates_pairs else [])
         increment = Increment(recover_interior, points)
         self._check_committed()
         self._check_histories()
-        first, self._fresh = self._fresh, False
-        if first:
+        is_first, self._is_first = self._is_first, False
+        if is_first:
             for contact in self.contacts:
                 contact.states.begin()
             self.state = replace(
                 self.state, contacts=tuple(c.states.committed for c in self.contacts)
             )
-            if not self.full.bulk.linear:  # whose tangent is that of u, and E may be another by now
+            if not self.full.bulk.linear:  # u and its tangent may have changed
                 self._increments.modulus.measure()
-        behind = any(state.interior is not None for state in (self._present, self.state))
-        if behind and not self.solver.is_current():
-            self._complete_all()  # what it takes is about to go
+        incomplete = any(state.interior is not None for state in (self._present, self.state))
+        if incomplete and not self.solver.is_current():
+            self._complete_all()  # before its factors are discarded
         self.solver.equations.factorisations = 0
         start_unknowns, diagonal = self.full.state(), self.full.diagonal.copy()
         at_present = self._is_present(start_unknowns)
-        self._take_committed_pairs()
+        self._restore_committed_pairs()
 
-        def back() -> None:
-            # What it starts from may have been completed meanwhile.
-            self._go_back(self._present.unknowns if at_present else start_unknowns)
-            if not self.full.bulk.linear:  # that of a failure would excuse any residual
+        def reset() -> None:
+            # The interior of the present state may have been recovered meanwhile.
+            self._reset_to(self._present.unknowns if at_present else start_unknowns)
+            if not self.full.bulk.linear:  # after a failure the scale would accept any residual
                 self.full.diagonal = diagonal.copy()
 
         try:
-            # A trial of a line search may overflow, and the convergence test and the verdict see
-            # it: a warning, on the rank that has the point, must not become an error there alone.
+            # A line search may overflow, which the convergence test and the verdict detect. A
+            # warning must not become an error on one rank alone.
             with np.errstate(all="ignore"):
                 while True:
                     with self.solver.options.present():
-                        found = self._increments.attempt(increment, self.state, self._present)
-                    if not isinstance(found, Retry):
+                        result = self._increments.attempt(increment, self.state, self._present)
+                    if not isinstance(result, Retry):
                         break
-                    if found is Retry.PAIRS:
+                    if result is Retry.PAIRS:
                         self._find_pairs(points)
-                    back()
-                    self._take_committed_pairs()
+                    reset()
+                    self._restore_committed_pairs()
                     points.begin(self.contacts)
-                    # Outside, lest a SNES that is made anew takes its options for the caller's.
-                    if found is Retry.UNKNOWNS:
-                        spread = sum(each.outcome == found.value for each in increment.tried)
-                        self.solver.change(anew=spread <= 1)
+                    # Outside of the block, in which a new SNES would read the solver's own options.
+                    if result is Retry.UNKNOWNS:
+                        count = sum(each.outcome == result.value for each in increment.attempts)
+                        self.solver.change(anew=count <= 1)
                 release_interrupt()
         except BaseException as error:
             raise_collectively(self._comm, error)
-            back()
+            reset()
             if not isinstance(error, NotConverged | ValueError):
                 self.solver.recover()
             raise
         finally:
             if self._comm.rank == 0:
                 self.solver.options.warn_of_unread(self._prefix)
-        self._trial, step = found
+        self._trial, step = result
         return step
 
     def _find_pairs(self, points: OppositePoints) -> None:
-        """Find the opposite points of an increment where that was chosen. Collective."""
+        """Find the opposite points in the states chosen for them. Collective."""
         if any(state.interior is not None for state in (self._present, self.state)):
-            # Other parts of the committed u are needed, and other pairs leave nothing to recover
-            # those of a trial from.
-            self._go_back(self._present.unknowns)
+            # The search needs the interior, which cannot be recovered after a change of pairs.
+            self._reset_to(self._present.unknowns)
             self._complete_all()
         points.find(self.state.unknowns)
 
-    def _take_committed_pairs(self) -> None:
-        """Go back to the committed state of contacts that have other pairs now. Collective."""
+    def _restore_committed_pairs(self) -> None:
+        """Restore the committed state of contacts whose pairs were replaced. Collective."""
         for contact in self.contacts:
             pairs = contact.states.committed.kinematics.pairs
             if (
@@ -401,16 +400,16 @@ class ContactProblem:
                 contact.states.restore()
 
     def _is_present(self, unknowns: Array) -> bool:
-        """Whether they are those of the present state. Collective."""
+        """Whether unknowns are those of the present state. Collective."""
         differs = not np.array_equal(unknowns, self._present.unknowns)
         return not self._comm.allreduce(int(differs))
 
     def _check_committed(self) -> None:
-        """Warn, once, where an increment with friction is solved and the last is no history."""
+        """Warn once if an increment with friction is solved again without a commit."""
         friction = any(contact.law.has_friction for contact in self.contacts)
-        if self._trial is None or self._told or not friction:
+        if self._trial is None or self._has_warned or not friction:
             return
-        self._told = True
+        self._has_warned = True
         warn(
             self._comm,
             f"increment {self.increment + 1} was solved but not committed, and is solved again "
@@ -428,8 +427,8 @@ class ContactProblem:
                     "present u"
                 )
 
-    def _go_back(self, unknowns: Array) -> None:
-        """Restore u, and the contacts of the trial or of the last commit. Collective."""
+    def _reset_to(self, unknowns: Array) -> None:
+        """Set u, and restore the contacts of the trial or of the last commit. Collective."""
         self.full.set_state(unknowns)
         trials = [None] * len(self.contacts) if self._trial is None else self._trial.contacts
         for contact, trial in zip(self.contacts, trials, strict=True):
@@ -472,7 +471,7 @@ class ContactProblem:
         return verdict
 
     def _complete_all(self) -> None:
-        """Complete the present state, and the committed one if it is another. Collective."""
+        """Recover the interior of the present and of the committed state. Collective."""
         self.complete()
         trial, unknowns = self._trial, self.full.state()
         if trial is None or self.state.interior is None:
@@ -482,7 +481,7 @@ class ContactProblem:
             self.complete()
         finally:
             self._trial = trial
-            self._go_back(unknowns)
+            self._reset_to(unknowns)
 
     @interrupts_held()
     def commit(self) -> None:
@@ -495,16 +494,16 @@ class ContactProblem:
         if self._trial is None:
             return
         trials = zip(self.contacts, self._trial.contacts, strict=True)
-        due = [
+        needs_update = [
             contact.contact_kinematics.needs_pair_update(trial.points) for contact, trial in trials
         ]
-        if any(due):  # which takes all of u, whatever of it was wanted
+        if any(needs_update):  # which needs a complete u
             self.complete()
         trial, start = self._trial, self.state
         try:
             self.full.set_state(trial.unknowns)
-            for contact, found in zip(self.contacts, trial.contacts, strict=True):
-                contact.states.commit(found)
+            for contact, solved in zip(self.contacts, trial.contacts, strict=True):
+                contact.states.commit(solved)
         except BaseException as error:
             raise_collectively(self._comm, error)
             for contact, state in zip(self.contacts, start.contacts, strict=True):
@@ -530,9 +529,9 @@ class ContactProblem:
         The history changes at `commit` only.
         """
         self._trial = None
-        self._go_back(self.state.unknowns)
+        self._reset_to(self.state.unknowns)
 
-    # ---- going on in another run -----------------------------------------------------------------
+    # ---- restart ---------------------------------------------------------------------------------
 
     def committed_rows(self) -> Array:
         """Return the committed state, from which another run can continue, as rows. Collective.
@@ -540,10 +539,10 @@ class ContactProblem:
         The interior displacement is recovered first, if it is out of date.
 
         Returns:
-            Array (N_ROWS, n_local) over this rank's unknowns: their values and the change of these
-            in the last increment (length); internal forces, external forces and the change of these
-            (force); masks of the unknowns retained by static condensation, and of those with
-            Dirichlet conditions.
+            Array (N_ROWS, n_local) over this rank's unknowns: their values and last change
+            (length); internal forces, external forces and the last change of the latter (force);
+            masks of the unknowns retained by static condensation, and of those with Dirichlet
+            conditions.
 
         Raises:
             ValueError: The present state is not that of the last commit.
@@ -596,22 +595,21 @@ class ContactProblem:
 
         Args:
             rows: The state.
-            numbers: Increments so far, `expected_increments`, and for every contact whether its
-                pairs are found anew.
-            points: For every contact, what `ContactStates.load_restart` takes: history, values.
+            numbers: Number of increments, `expected_increments`, and for every contact whether its
+                pairs are to be found again.
+            points: History and values of every contact for `ContactStates.load_restart`.
         """
         state, change, internal, external, load_change, retained, _ = rows
         increment, self.expected_increments, *anew = (int(number) for number in numbers)
-        self._fresh, self._trial = False, None
+        self._is_first, self._trial = False, None
         self.solver.keep(np.flatnonzero(retained).astype(np.int32))
         self.full.set_state(state)
         load = self.full.present_load()
         self.full.begin(load)
         for contact, (history, values), again in zip(self.contacts, points, anew, strict=True):
             contact.states.load_restart(history, values, anew=bool(again))
-        found = Forces(state, internal, external, self.full.label)
-        forces: dict[object, Forces] = {self.full.coordinate_id: found}
-        energy = EnergyState.at(forces, self.contacts)
+        forces = Forces(state, internal, external, self.full.label)
+        energy = EnergyState.at({self.full.coordinate_id: forces}, self.contacts)
         self.state = State(
             unknowns=state.copy(),
             contacts=tuple(contact.states.committed for contact in self.contacts),

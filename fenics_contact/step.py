@@ -61,7 +61,8 @@ class Step:
         For every contact, "force" is ∫ -r_n, "friction ∫|τ|" the integral of the magnitude, and
         "resultant" the force vector on the body. A contact whose forces do not exceed the tolerance
         of the residual (`ForceBalance.is_loaded`) has "no contact force". Small-displacement errors
-        of force or pressure are stated from 1 % on.
+        are stated from 1 % of force or pressure on, and at the end whether values are per unit
+        thickness.
         """
         parts = [f"increment {self.increment}"]
         if self.load is not None:
