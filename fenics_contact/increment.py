@@ -175,9 +175,9 @@ class IncrementSolver:
             solver.predictor.store_converged_contacts()
         increment.attempts += attempts
         if reason <= 0 and points.drop_prediction():
-            return increment.ends(Retry.FROM_COMMITTED)
+            return increment.set_outcome(Retry.FROM_COMMITTED)
         if solver.needs_more_dofs(found=reason > 0):
-            return increment.ends(Retry.UNKNOWNS)
+            return increment.set_outcome(Retry.UNKNOWNS)
         if reason > 0 and (outdated := points.to_update()):
             return self._choose_pairs(increment, outdated, interior)
         kinematics = reason > 0  # after a failure there may be no factors
@@ -196,7 +196,7 @@ class IncrementSolver:
             verdict = replace(verdict, friction_energy_gain=energy.friction_energy_gain)
         if energy is None or verdict.failures:
             if points.drop_prediction():
-                return increment.ends(Retry.FROM_COMMITTED)
+                return increment.set_outcome(Retry.FROM_COMMITTED)
             raise self._not_converged(state, reason, verdict, increment.attempts)
         self.verifier.warn_of_large_motion(verdict)
         self.verifier.warn_of_round_off(verdict)
@@ -250,7 +250,7 @@ class IncrementSolver:
         if interior is not None:
             self.solver.system.complete(interior)
         increment.points.choose_states(contacts, self.full.state())
-        return increment.ends(Retry.PAIRS)
+        return increment.set_outcome(Retry.PAIRS)
 
     def _can_skip_recovery(self, state: State) -> bool:
         """Whether energies and pairs do not depend on the interior displacement. Collective."""
