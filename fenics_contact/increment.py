@@ -147,12 +147,12 @@ class IncrementSolver:
         self.full.scales.begin(self.full.operators)
         solver.system.begin(load)
         solver.equations.initial_unknowns = state.unknowns
-        led = np.where(self.full.constrained, before, self.full.state())
-        end = set_slip_reference_at_touch(self.full, led, solver.end_without)
+        positioned = np.where(self.full.constrained, before, self.full.state())
+        end = set_slip_reference_at_touch(self.full, positioned, solver.end_without)
         solver.predictor.change = state.change
         solver.predictor.expected = end if points.end is None else points.end
         with solver.system.restricted_contacts():
-            reason, attempts, rounds = solver.solve(
+            reason, attempts, augmentations = solver.solve(
                 cold=cold,
                 stiffness_changed=stiffness_changed,
                 load_before=state.load,
@@ -210,7 +210,7 @@ class IncrementSolver:
             increment=state.increment + 1,
             reason=reason,
             iterations=sum(attempt.iterations for attempt in increment.attempts),
-            augmentations=rounds,
+            augmentations=augmentations,
             method=increment.attempts[-1].method,
             factorisations=solver.equations.factorisations,
             verdict=verdict,
@@ -302,24 +302,28 @@ class IncrementSolver:
         return energies.since(start, self.full.contacts, self.full.scales)
 
     def _verify_all(
-        self, began: Array, *, kinematics: bool, assemble: bool
+        self, initial_unknowns: Array, *, kinematics: bool, assemble: bool
     ) -> tuple[Verdict, EnergyState]:
         """Verify a complete u with the assembled residual of the bulk, or K u. Collective."""
         if assemble:
             bulk = self.full.with_obstacles(self.full.bulk.assemble_residual())
         else:
             bulk = self.full.product_force()
-        verdict, own = self.verify_system(self.full, bulk, began=began, kinematics=kinematics)
+        verdict, own = self.verify_system(
+            self.full, bulk, initial_unknowns=initial_unknowns, kinematics=kinematics
+        )
         forces: dict[object, Forces] = {self.full.coordinate_id: own}
         if self.solver.condensed and self.full.bulk.symmetric:
             forces[self.solver.system.coordinate_id] = self.solver.system.present_forces()
         return verdict, EnergyState.at(forces, self.full.contacts)
 
-    def _verify_retained(self, began: Array, *, kinematics: bool) -> tuple[Verdict, EnergyState]:
+    def _verify_retained(
+        self, initial_unknowns: Array, *, kinematics: bool
+    ) -> tuple[Verdict, EnergyState]:
         """Verify the condensed equations, without the interior displacement. Collective."""
         system = self.solver.system
         verdict, forces = self.verify_system(
-            system, system.bulk_force(), began=began, kinematics=kinematics
+            system, system.bulk_force(), initial_unknowns=initial_unknowns, kinematics=kinematics
         )
         return verdict, EnergyState.at({system.coordinate_id: forces}, self.full.contacts)
 
@@ -328,7 +332,7 @@ class IncrementSolver:
         system: System,
         bulk: Array,
         *,
-        began: Array | None = None,
+        initial_unknowns: Array | None = None,
         kinematics: bool = False,
     ) -> tuple[Verdict, Forces]:
         """Verify the increment solved last by `Verifier.verify`. Collective.
@@ -336,8 +340,7 @@ class IncrementSolver:
         Args:
             system: The unknowns of the residual.
             bulk: Residual of the bulk on these (force).
-            began: The unknowns at the beginning of the increment; None: laws, rigid obstacles and
-                paths are not verified.
+            initial_unknowns: Unknowns at the beginning; None: see `Verifier.verify`.
             kinematics: Whether to estimate the small-displacement error.
         """
         equations = self.solver.equations
@@ -346,6 +349,6 @@ class IncrementSolver:
             bulk,
             start=equations.start,
             rtol=equations.rtol,
-            began=began,
+            initial_unknowns=initial_unknowns,
             respond=self.solver.respond if kinematics else None,
         )

@@ -65,7 +65,7 @@ class Verifier:
         *,
         start: InitialForces,
         rtol: float,
-        began: Array | None,
+        initial_unknowns: Array | None,
         respond: TangentSolve | None = None,
     ) -> tuple[Verdict, Forces]:
         """Recompute residual, balance and laws at evaluated contacts. Collective.
@@ -75,15 +75,15 @@ class Verifier:
             bulk: Residual of the bulk on these (force).
             start: Forces at the beginning of the increment.
             rtol: Residual accepted, relative to the forces.
-            began: The unknowns at the beginning of the increment; None: laws, rigid obstacles and
-                paths are not verified, and tractions are those evaluated last.
+            initial_unknowns: Unknowns at the beginning; None: laws, rigid obstacles and paths are
+                not verified, and tractions are those evaluated last.
             respond: Solves with the tangent for the small-displacement error; None: the error is
                 not estimated.
 
         Returns:
             The verdict, and the forces at the unknowns, with reactions.
         """
-        laws = began is not None
+        laws = initial_unknowns is not None
         contacts = system.contact_forces(evaluated=not laws)
         total = sum(contacts, bulk)
         norms = system.norms(total, contacts, start)
@@ -101,11 +101,13 @@ class Verifier:
         complete = system is self._full
         # Opposing bodies are known on the retained dofs only, unless u is complete.
         before, tunnelling, ejected = None, {}, {}
-        if began is not None:
-            before = self._full.displacement_at(began)
+        if initial_unknowns is not None:
+            before = self._full.displacement_at(initial_unknowns)
             tunnelling = self._obstacles.evaluate(before)
             if complete:
-                ejected = find_ejected_bodies(self._full, self._motions, contacts, began, start)
+                ejected = find_ejected_bodies(
+                    self._full, self._motions, contacts, initial_unknowns, start
+                )
         if complete:
             tunnelling |= self._bodies.evaluate(before)
         verdict = Verdict(

@@ -1,1 +1,1 @@
-"""Errors of a solution, and meshes that make them small."""
+"""Error estimates of a solution, and adaptive mesh refinement."""

@@ -92,8 +92,8 @@ def adapt(
     for _ in range(levels):
         if budget is not None:
             assert budget.cells is not None
-            cells = _worst(mesh.comm, budget.cells, share)
-            mesh, facet_tags = _split(mesh, facet_tags, cells, snap or {})
+            cells = _mark_cells(mesh.comm, budget.cells, share)
+            mesh, facet_tags = _refine(mesh, facet_tags, cells, snap or {})
         problem, stress, *strain = solve(mesh, facet_tags)
         budget = estimate_errors(problem, stress, strain=strain[0] if strain else None)
         dofmap = problem.u.function_space.dofmap
@@ -101,27 +101,27 @@ def adapt(
         yield AdaptationLevel(mesh, facet_tags, problem, budget, dofs)
 
 
-def _worst(comm: MPI.Comm, squares: Array, share: float) -> npt.NDArray[np.int32]:
-    """This rank's cells among those that make a share of the sum, largest first. Collective."""
-    everywhere = np.sort(gather_rows(comm, squares))[::-1]
-    sums = np.cumsum(everywhere)
-    last = int(np.searchsorted(sums, share * sums[-1])) if sums.size else 0
-    least = everywhere[min(last, len(everywhere) - 1)]
-    return np.flatnonzero(squares >= least).astype(np.int32)
+def _mark_cells(comm: MPI.Comm, squares: Array, fraction: float) -> npt.NDArray[np.int32]:
+    """Return this rank's cells by bulk (Dörfler) marking of squared errors. Collective."""
+    all_squares = np.sort(gather_rows(comm, squares))[::-1]
+    sums = np.cumsum(all_squares)
+    last = int(np.searchsorted(sums, fraction * sums[-1])) if sums.size else 0
+    threshold = all_squares[min(last, len(all_squares) - 1)]
+    return np.flatnonzero(squares >= threshold).astype(np.int32)
 
 
-def _split(
+def _refine(
     mesh: dolfinx.mesh.Mesh,
     tags: dolfinx.mesh.MeshTags,
     cells: npt.NDArray[np.int32],
     snap: Mapping[int, Callable[[Array], Array]],
 ) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """Split the edges of cells, and what must be split with them. Collective."""
+    """Bisect the edges of cells, and of neighbours for conformity; snap new nodes. Collective."""
     d = mesh.topology.dim
     mesh.topology.create_entities(1)
     mesh.topology.create_connectivity(d - 1, d)
     edges = dolfinx.mesh.compute_incident_entities(mesh.topology, cells, d, 1)
-    # Cells stay with their rank: tags can only be handed down there.
+    # Without a partitioner: tags can only be transferred on the same rank.
     finer, parents, facets = dolfinx.mesh.refine(
         mesh, edges, partitioner=None, option=dolfinx.mesh.RefinementOption.parent_cell_and_facet
     )
@@ -129,10 +129,10 @@ def _split(
         finer.topology.create_entities(dim)
     finer.topology.create_connectivity(d - 1, d)
     finer_tags = dolfinx.mesh.transfer_meshtag(tags, finer, parents, facets)
-    for tag, place in snap.items():
-        sides = finer_tags.find(tag)
-        if not sides.size:
+    for tag, project in snap.items():
+        tagged = finer_tags.find(tag)
+        if not tagged.size:
             continue  # DOLFINx 0.9 crashes without any
-        nodes = np.unique(dolfinx.mesh.entities_to_geometry(finer, d - 1, sides))
-        finer.geometry.x[nodes, :d] = place(finer.geometry.x[nodes, :d])
+        nodes = np.unique(dolfinx.mesh.entities_to_geometry(finer, d - 1, tagged))
+        finer.geometry.x[nodes, :d] = project(finer.geometry.x[nodes, :d])
     return finer, finer_tags

@@ -1,8 +1,7 @@
 """Error estimates of a solution by source: enforcement, mesh, increments, kinematics, solver.
 
-Each error is estimated separately, for contact force, peak pressure and displacement. Those of
-enforcement, kinematics and solver follow from linear solves with the present tangent, that of the
-discretisation from stress recovery, and that of the increments from their halves (`increments`).
+The errors of enforcement, kinematics and solver follow from linear solves with the present tangent,
+the discretisation error from stress recovery, and that of the increments from halved ones.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ __all__ = ["ErrorBudget", "estimate_errors", "quantities"]
 
 
 DISPLACEMENT = "displacement"
-# What to change where a part dominates.
+# What to change if a source dominates.
 _REMEDIES = {
     "enforcement": 'Contact(enforcement="augmented"), with it a smaller tolerance,',
     "discretisation": "a finer mesh at the contact, or a higher degree",
@@ -43,8 +42,8 @@ _REMEDIES = {
 }
 
 
-# Facets in a row under pressure from which on discretisation is estimated reliably.
-_FEW = 5
+# Facets under pressure in a row, below which the estimate of the discretisation is unreliable.
+_MIN_RELIABLE_FACETS = 5
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,7 @@ class ErrorBudget:
     cells: Array | None = field(default=None, repr=False, compare=False)
 
     def numbers(self) -> dict[str, Any]:
-        """Return all attributes except ``cells``, for files; invert it by ``ErrorBudget(**…)``."""
+        """Return all attributes except ``cells``, as arguments of ``ErrorBudget``."""
         names = ("values", "parts", "wanted", "h", "across", "degree", "energy")
         return {name: getattr(self, name) for name in names}
 
@@ -94,12 +93,12 @@ class ErrorBudget:
         """
         if self.wanted is None:
             return self.h
-        needed = self.h
+        size = self.h
         for name, error in self.relative("discretisation").items():
             rate = min(self.degree, 1.5) * (1 if name.endswith("pressure") else 2)
             if error > self.wanted:
-                needed = min(needed, self.h * (self.wanted / error) ** (1 / rate))
-        return needed
+                size = min(size, self.h * (self.wanted / error) ** (1 / rate))
+        return size
 
     def relative(self, part: str) -> dict[str, float]:
         """Return the relative errors of a source without sign, by quantity."""
@@ -136,28 +135,28 @@ class ErrorBudget:
     def _repr_html_(self) -> str:
         """Return a table of the errors in per cent for notebooks, with the total."""
         total = self.total
-        together = ("together", *(f"{100 * total[name]:.2g}" for name in self.values))
+        total_row = ("together", *(f"{100 * total[name]:.2g}" for name in self.values))
         header = ("error in %", *self.values)
-        return html_table("Error budget", header, [*self._rows(), together], self._remarks())
+        return html_table("Error budget", header, [*self._rows(), total_row], self._remarks())
 
     def _rows(self) -> list[tuple[str, ...]]:
-        """Every part with its errors in per cent."""
+        """Return every source with its errors in per cent."""
         rows = []
         for part in _REMEDIES:
-            found = self.relative(part) if part in self.parts else {}
+            errors = self.relative(part) if part in self.parts else {}
             cells = (
-                f"{100 * found[n]:.2g}" if n in found else "not estimated" for n in self.values
+                f"{100 * errors[n]:.2g}" if n in errors else "not estimated" for n in self.values
             )
             rows.append((part, *cells))
         return rows
 
     def _remarks(self) -> list[str]:
-        """What to change, and how far the table can be trusted."""
+        """Return advice, and the reliability of the estimate."""
         lines = [f"{self.dominant} dominates: {_REMEDIES[self.dominant]} would help most"]
-        if 0 < self.across < _FEW:
+        if 0 < self.across < _MIN_RELIABLE_FACETS:
             lines.append(
                 f"only about {self.across:.0f} facets in a row are under pressure: the estimate of "
-                f"discretisation is unreliable with fewer than {_FEW}"
+                f"discretisation is unreliable with fewer than {_MIN_RELIABLE_FACETS}"
             )
         if self.wanted is not None:
             size = f"facets of {self.h_wanted:.2g} at the contact, now {self.h:.2g}"
@@ -167,12 +166,12 @@ class ErrorBudget:
 
 
 def quantities(problem: ContactProblem) -> dict[str, float]:
-    """The quantities of an `ErrorBudget` at the problem's present state. Collective."""
-    found: dict[str, float] = {}
+    """Return the quantities of an `ErrorBudget` at the problem's present state. Collective."""
+    values: dict[str, float] = {}
     for contact in problem.contacts:
         r = contact.resultants()
-        found |= _named(problem, contact, r.normal_force, r.tangential_force, r.max_pressure)
-    return found | {DISPLACEMENT: _displacement(problem, problem.present_state())}
+        values |= _name_values(problem, contact, r.normal_force, r.tangential_force, r.max_pressure)
+    return values | {DISPLACEMENT: _displacement(problem, problem.present_state())}
 
 
 def estimate_errors(
@@ -184,10 +183,9 @@ def estimate_errors(
 ) -> ErrorBudget:
     """Estimate the errors of the last solution by source, before or after its commit. Collective.
 
-    Errors of contact forces, peak pressures and displacement are estimated: by linearisation for
-    enforcement, small displacements and solver, and by stress recovery for the discretisation. The
-    estimates are not bounds. The cost is a factorisation of the tangent (a dense one of a condensed
-    problem) and a projection of stress and strain.
+    Errors of contact forces, peak pressures and displacement are estimated by linearisation and
+    stress recovery; the estimates are not bounds. The cost is a factorisation of the tangent (a
+    dense one of a condensed problem) and a projection of stress and strain.
 
     Args:
         problem: A problem that has been solved; its state does not change.
@@ -216,12 +214,12 @@ def estimate_errors(
             "or (3, 3)"
         )
     values = quantities(problem)
-    parts = _linear_parts(problem, values)
-    smooth = _Smoothed(problem, stress, strain)
-    parts["discretisation"] = _discretisation(problem, smooth, values)
+    parts = _linearised_errors(problem, values)
+    recovery = _StressRecovery(problem, stress, strain)
+    parts["discretisation"] = _discretisation_errors(problem, recovery, values)
     if increment_error is not None:
         parts["increments"] = dict(increment_error)
-    h, across = _bearing_facets(problem)
+    h, across = _measure_loaded_facets(problem)
     return ErrorBudget(
         values,
         {name: parts[name] for name in _REMEDIES if name in parts},
@@ -229,56 +227,53 @@ def estimate_errors(
         h=h,
         across=across,
         degree=displacement.degree,
-        energy=float(np.sqrt(smooth.share)),
-        cells=smooth.squares,
+        energy=float(np.sqrt(recovery.ratio)),
+        cells=recovery.squares,
     )
 
 
 def _conjugate_strain(displacement: Displacement, stress: Any) -> Any:
-    """The small strain that the stress does work on, of its shape (UFL)."""
+    """Return the small strain conjugate to the stress, in its shape (UFL)."""
     u = displacement.expression
     strain = ufl.sym(ufl.grad(u))
     if stress.ufl_shape != (3, 3) or strain.ufl_shape == (3, 3):
         return strain
     hoop = u[0] / ufl.SpatialCoordinate(displacement.u.function_space.mesh)[0]
-    across = hoop if displacement.is_undifferentiated_in(stress) else 0
+    out_of_plane = hoop if displacement.is_undifferentiated_in(stress) else 0
     (xx, xy), (_, yy) = ([strain[i, j] for j in range(2)] for i in range(2))
-    return ufl.as_tensor([[xx, xy, 0], [xy, yy, 0], [0, 0, across]])
+    return ufl.as_tensor([[xx, xy, 0], [xy, yy, 0], [0, 0, out_of_plane]])
 
 
-def _bearing_facets(problem: ContactProblem) -> tuple[float, float]:
-    """Mean size area^(1/(d-1)) of the facets under pressure, and how many are in a row. Collective.
-
-    Of all contacts together; size (length).
-    """
+def _measure_loaded_facets(problem: ContactProblem) -> tuple[float, float]:
+    """Return mean size (length) and number in a row of the facets under pressure. Collective."""
     d = problem.u.function_space.mesh.geometry.dim
     sums = np.zeros(2)
     for contact in problem.contacts:
         rows = contact.quadrature.point_rows
-        bears = np.any(contact.pressure[rows] > 0, axis=1)
+        loaded = np.any(contact.pressure[rows] > 0, axis=1)
         sizes = contact.quadrature.facet_sizes[rows[:, 0]]
-        sums += [np.sum(bears * sizes), np.count_nonzero(bears)]
+        sums += [np.sum(loaded * sizes), np.count_nonzero(loaded)]
     size, count = global_sum(problem.u.function_space.mesh.comm, sums)
     return (float(size / count), float(count ** (1 / (d - 1)))) if count else (0.0, 0.0)
 
 
-def _named(
+def _name_values(
     problem: ContactProblem, contact: Contact, normal: float, friction: float, peak: float
 ) -> dict[str, float]:
-    before = f"{contact.name}: " if len(problem.contacts) > 1 else ""
-    found = {f"{before}normal force": normal}
+    prefix = f"{contact.name}: " if len(problem.contacts) > 1 else ""
+    values = {f"{prefix}normal force": normal}
     if contact.law.has_tangential:
-        found[f"{before}friction force"] = friction
-    return found | {f"{before}peak pressure": peak}
+        values[f"{prefix}friction force"] = friction
+    return values | {f"{prefix}peak pressure": peak}
 
 
 def _displacement(problem: ContactProblem, state: Array) -> float:
-    """Displacement of the loads along themselves; without loads the largest one."""
+    """Return the mean displacement along the loads; without loads the largest one."""
     comm, load = problem.u.function_space.mesh.comm, problem.load
-    of_nodes = np.linalg.norm(problem.displacement.vectors(load), axis=1)
-    others = load.copy()  # forces on free obstacles
-    others[: problem.full.unknowns.n_dofs] = 0.0
-    size, work = global_sum(comm, [of_nodes.sum() + np.abs(others).sum(), load @ state])
+    nodal = np.linalg.norm(problem.displacement.vectors(load), axis=1)
+    on_obstacles = load.copy()
+    on_obstacles[: problem.full.unknowns.n_dofs] = 0.0
+    size, work = global_sum(comm, [nodal.sum() + np.abs(on_obstacles).sum(), load @ state])
     if size > 0:
         return float(work / size)
     return longest(comm, problem.displacement.vectors(state))
@@ -287,90 +282,91 @@ def _displacement(problem: ContactProblem, state: Array) -> float:
 # ---- enforcement and solver ----------------------------------------------------------------------
 
 
-def _linear_parts(
+def _linearised_errors(
     problem: ContactProblem, values: Mapping[str, float]
 ) -> dict[str, dict[str, float]]:
-    """What the springs and the residual that is left have changed in the quantities."""
+    """Return the errors of enforcement, kinematics and solver in the quantities."""
     contacts, operators = problem.contacts, problem.full.operators
     springs = [spring_stiffness(contact) for contact in contacts]
-    stretches = [_stretch(contact) for contact in contacts]
-    found = {}
+    penalty_jumps = [_penalty_jump(contact) for contact in contacts]
+    errors = {}
 
-    def differences(way: Array, shifts: list[Array]) -> dict[str, float]:
-        jumps = [shift + o.jump(way) for o, shift in zip(operators, shifts, strict=True)]
-        changes = [traction_change(k, jump) for k, jump in zip(springs, jumps, strict=True)]
-        return _differences(problem, values, changes, way)
+    def differences(change: Array, shifts: list[Array]) -> dict[str, float]:
+        jumps = [shift + o.jump(change) for o, shift in zip(operators, shifts, strict=True)]
+        tractions = [traction_change(k, jump) for k, jump in zip(springs, jumps, strict=True)]
+        return _differences(problem, values, tractions, change)
 
     with problem.linearised(springs) as solve:
-        found["solver"] = differences(solve(None), [np.zeros_like(s) for s in stretches])
-        # The springs' rest lengths follow what they carry: a round of augmented enforcement.
-        # It leaves 1/(1 + k_n h/E) of the error in the shortest waves and far less in the long ones
-        # that forces are made of.
-        way = solve([traction_change(*both) for both in zip(springs, stretches, strict=True)])
-        found["enforcement"] = differences(way, stretches)
-    moved = [Deviation.of(contact).linearised(contact) for contact in contacts]
-    with problem.linearised([k for k, _ in moved]) as solve:
-        way = solve([added for _, added in moved])
-        pairs = zip(moved, operators, strict=True)
-        changes = [added + traction_change(k, o.jump(way)) for (k, added), o in pairs]
-        found["kinematics"] = _differences(problem, values, changes, way)
-    return found
+        errors["solver"] = differences(solve(None), [np.zeros_like(s) for s in penalty_jumps])
+        # One augmentation leaves 1/(1 + k_n h/E) of the error at the shortest wavelengths, and far
+        # less at the long ones that determine forces.
+        change = solve(
+            [traction_change(*both) for both in zip(springs, penalty_jumps, strict=True)]
+        )
+        errors["enforcement"] = differences(change, penalty_jumps)
+    deformed = [Deviation.of(contact).linearised(contact) for contact in contacts]
+    with problem.linearised([k for k, _ in deformed]) as solve:
+        change = solve([added for _, added in deformed])
+        pairs = zip(deformed, operators, strict=True)
+        tractions = [added + traction_change(k, o.jump(change)) for (k, added), o in pairs]
+        errors["kinematics"] = _differences(problem, values, tractions, change)
+    return errors
 
 
-def _stretch(contact: Contact) -> Array:
-    """Displacement that is in the springs because their stiffness stands for none at all.
+def _penalty_jump(contact: Contact) -> Array:
+    """Return the jump due to the penalty, projected onto displacements of Γc. Collective.
 
-    As far as displacements of Γc can answer it; none where the stiffness is physical. Collective.
+    It is zero if the stiffness is physical.
 
     Returns:
         Array (n_points, gdim) (length).
     """
     law, values, normal = contact.law, contact.values, contact.values.normal
-    stretch = np.zeros_like(normal)
+    jump = np.zeros_like(normal)
     if not is_regularised(law):
-        return stretch
+        return jump
     pressure: Array = np.zeros(len(normal))
     if law.has_normal_stiffness:
         pressure = contact.traces(contact.pressure)
-    side = contact.traces(contact.tangential_traction)
+    tangential = contact.traces(contact.tangential_traction)
     if contact.multipliers is not None:
         pressure = pressure - contact.multipliers.fields.values("pressure")
         if law.has_friction:
-            side = side - contact.multipliers.fields.values("traction")
-    borne = side - pressure[:, None] * normal
+            tangential = tangential - contact.multipliers.fields.values("traction")
+    traction = tangential - pressure[:, None] * normal
     if law.has_normal_stiffness:
-        along = -np.sum(borne * normal, axis=1)
-        stretch += (along / contact.normal_stiffness)[:, None] * normal
+        along = -np.sum(traction * normal, axis=1)
+        jump += (along / contact.normal_stiffness)[:, None] * normal
     if law.has_tangential:
-        # K_t has no inverse along the normal, where nothing acts: any stiffness will do.
+        # K_t is made regular by any stiffness along the normal, where the traction is zero.
         along = np.einsum("q,qi,qj->qij", values.parameters["k_t"], normal, normal)
-        across = values.tangential(borne)[:, :, None]
-        stretch -= np.linalg.solve(contact.tangential_stiffness + along, across)[:, :, 0]
-    return stretch
+        rhs = values.tangential(traction)[:, :, None]
+        jump -= np.linalg.solve(contact.tangential_stiffness + along, rhs)[:, :, 0]
+    return jump
 
 
 def _differences(
-    problem: ContactProblem, values: Mapping[str, float], changes: list[Array], way: Array
+    problem: ContactProblem, values: Mapping[str, float], tractions: list[Array], unknowns: Array
 ) -> dict[str, float]:
-    """Present quantities minus those after a change of tractions and displacements."""
+    """Return the present quantities minus those after changes of tractions and unknowns."""
     comm = problem.u.function_space.mesh.comm
     after: dict[str, float] = {}
-    for contact, change in zip(problem.contacts, changes, strict=True):
+    for contact, change in zip(problem.contacts, tractions, strict=True):
         normal, measure = contact.values.normal, contact.measure
         along = np.sum(change * normal, axis=1)
-        pressure, side = contact.pressure - along, change - along[:, None] * normal
-        friction = np.linalg.norm(contact.tangential_traction + side, axis=1)
+        pressure, tangential = contact.pressure - along, change - along[:, None] * normal
+        friction = np.linalg.norm(contact.tangential_traction + tangential, axis=1)
         if contact.law.has_friction:
             friction = np.minimum(friction, _friction_bound(contact, pressure))
         sums = global_sum(comm, [measure @ pressure, measure @ friction])
         peak = global_max(comm, pressure)
-        after |= _named(problem, contact, float(sums[0]), float(sums[1]), peak)
-    after[DISPLACEMENT] = _displacement(problem, problem.present_state() + way)
+        after |= _name_values(problem, contact, float(sums[0]), float(sums[1]), peak)
+    after[DISPLACEMENT] = _displacement(problem, problem.present_state() + unknowns)
     return {name: values[name] - after[name] for name in values}
 
 
 def _friction_bound(contact: Contact, pressure: Array) -> Array:
-    """Friction bound at the points under another pressure (stress)."""
+    """Return the friction bound at the points under another pressure (stress)."""
     values = contact.values
     bound = values.friction_bound
     changed = bound + values.friction_bound_slope * (pressure - contact.pressure)
@@ -380,14 +376,14 @@ def _friction_bound(contact: Contact, pressure: Array) -> Array:
 # ---- discretisation ------------------------------------------------------------------------------
 
 
-class _Smoothed:
-    """Stresses and strains beside smooth ones (Zienkiewicz and Zhu). The constructor is collective.
+class _StressRecovery:
+    """Stress recovery by Zienkiewicz and Zhu. The constructor is collective.
 
     Attributes:
-        stress: Smooth σ* (UFL).
+        stress: Recovered stress σ* (UFL).
         squares: η² = ∫ (σ* - σ):(ε* - ε) of every owned cell (force times length).
         twice_energy: ∫ σ:ε (force times length).
-        share: Sum of the squares over that.
+        ratio: Sum of η² divided by ∫ σ:ε.
     """
 
     def __init__(self, problem: ContactProblem, stress: Any, strain: Any) -> None:
@@ -395,107 +391,101 @@ class _Smoothed:
         weight = problem.contacts[0].inputs.weight if problem.contacts else 1.0
         degree = problem.displacement.degree
         dx = ufl.dx(mesh, metadata={"quadrature_degree": 2 * degree})
-        self.stress, smooth_strain = _smoothed(mesh, [stress, strain], degree, weight, dx)
-        gap = ufl.inner(self.stress - stress, smooth_strain - strain)
+        self.stress, recovered_strain = _project_tensors(mesh, [stress, strain], degree, weight, dx)
+        error = ufl.inner(self.stress - stress, recovered_strain - strain)
         q = ufl.TestFunction(fem.functionspace(mesh, ("DG", 0)))
-        both = [weight * q * density * dx for density in (gap, ufl.inner(stress, strain))]
+        both = [weight * q * density * dx for density in (error, ufl.inner(stress, strain))]
         n = mesh.topology.index_map(mesh.topology.dim).size_local
-        # Every cell has one value, by its own number.
+
         self.squares, energies = (
             fem.assemble_vector(compile_form(form)).array[:n].copy() for form in both
         )
         total, self.twice_energy = global_sum(mesh.comm, [self.squares.sum(), energies.sum()])
-        self.share = abs(total / self.twice_energy) if self.twice_energy else 0.0
+        self.ratio = abs(total / self.twice_energy) if self.twice_energy else 0.0
 
 
-def _discretisation(
-    problem: ContactProblem, smooth: _Smoothed, values: Mapping[str, float]
+def _discretisation_errors(
+    problem: ContactProblem, recovery: _StressRecovery, values: Mapping[str, float]
 ) -> dict[str, float]:
-    """The potential energy is off by η²/2.
+    """Return the discretisation errors of the quantities.
 
-    Per elastic energy that is the relative error of what a prescribed displacement needs as force,
-    or of how far a force goes. Friction is told from its share in the normal force that the smooth
-    stress has on Γc, the peak from the pressure smoothed on Γc itself.
+    The error η²/2 of the potential energy, divided by the elastic energy, is the relative error of
+    the force at prescribed displacements, or of the displacement under prescribed forces. The error
+    of friction follows from its ratio to the normal force by the recovered stress on Γc, that of
+    the peak from the pressure smoothed on Γc.
     """
     contacts, mesh = problem.contacts, problem.u.function_space.mesh
-    state, twice, share = problem.present_state(), smooth.twice_energy, smooth.share
+    state, twice, ratio = problem.present_state(), recovery.twice_energy, recovery.ratio
     work = float(global_sum(mesh.comm, problem.load @ state))
-    loaded = float(np.clip(work / twice, 0.0, 1.0)) if twice else 0.0
-    driven = 1.0 - loaded
-    found: dict[str, float] = {}
+    by_loads = float(np.clip(work / twice, 0.0, 1.0)) if twice else 0.0
+    by_displacements = 1.0 - by_loads
+    errors: dict[str, float] = {}
     for contact in contacts:
         d, normals = mesh.geometry.dim, contact.values.normal
-        plane = ufl.as_tensor([[smooth.stress[i, j] for j in range(d)] for i in range(d)])
+        plane = ufl.as_tensor([[recovery.stress[i, j] for j in range(d)] for i in range(d)])
         outward = ufl.dot(plane, ufl.FacetNormal(mesh))
         traction = PointEvaluator(contact.quadrature, {"traction": outward})()["traction"]
         normal = np.sum(traction * normals, axis=1)
-        side = np.linalg.norm(traction - normal[:, None] * normals, axis=1)
+        tangential = np.linalg.norm(traction - normal[:, None] * normals, axis=1)
         closed = contact.status != Status.OPEN
         measure = contact.measure * closed
-        smooth_normal, smooth_friction = global_sum(mesh.comm, [-measure @ normal, measure @ side])
+        recovered = global_sum(mesh.comm, [-measure @ normal, measure @ tangential])
         r = contact.resultants()
-        error = share * driven * r.normal_force
-        # Smoothing carries traction beyond the end of contact: normal and tangential alike, so that
-        # their ratio stays.
-        kept = (r.normal_force - error) / smooth_normal if smooth_normal > 0 else 1.0
-        friction = r.tangential_force - kept * smooth_friction
+        error = ratio * by_displacements * r.normal_force
+        # Recovery spreads traction beyond the contact zone, but keeps the ratio of its components.
+        scale = (r.normal_force - error) / recovered[0] if recovered[0] > 0 else 1.0
+        friction = r.tangential_force - scale * recovered[1]
         if contact.law.has_friction and not contact.law.has_potential and not r.stick:
-            # All of it is the law's share of the pressure.
+            # All points slip: friction is proportional to the pressure.
             friction = error * r.tangential_force / (r.normal_force or 1.0)
-        found |= _named(
-            problem,
-            contact,
-            error,
-            friction,
-            r.max_pressure - _smooth_peak(contact),
-        )
+        peak = r.max_pressure - _smooth_peak(contact)
+        errors |= _name_values(problem, contact, error, friction, peak)
     if not np.any(global_sum(mesh.comm, np.abs(problem.load).sum())):
-        loaded = 0.0 if _largest_is_prescribed(problem, state) else 1.0
-    found[DISPLACEMENT] = -share * loaded * values[DISPLACEMENT]
-    return found
+        by_loads = 0.0 if _is_largest_prescribed(problem, state) else 1.0
+    errors[DISPLACEMENT] = -ratio * by_loads * values[DISPLACEMENT]
+    return errors
 
 
 def _smooth_peak(contact: Contact) -> float:
-    """Largest pressure when its means over the facets are smoothed. Collective.
+    """Return the peak of the facet means of the pressure, smoothed on Γc. Collective.
 
-    Smooth stresses of the bulk would not do: at a boundary they are of less than the pressure's own
-    accuracy. Means and linear functions serve any degree and rule, for the pressure ends like a
-    square root and is nowhere of more than the order h² that they have.
+    Stresses recovered in the bulk are less accurate at a boundary. Means and linear functions of
+    order h² suffice for any degree, since the pressure ends with a square root.
     """
     quadrature, submesh = contact.quadrature, contact.surface.submesh
     n_cells = submesh.topology.index_map(submesh.topology.dim).size_local
     points = quadrature.space().dofmap.list[:n_cells]
     weights, pressure = quadrature.weights[points], contact.pressure[points]
     space = fem.functionspace(submesh, ("DG", 0))
-    mean, bears = fem.Function(space), fem.Function(space)
+    mean, loaded = fem.Function(space), fem.Function(space)
     cells = space.dofmap.list[:n_cells, 0]
     mean.x.array[cells] = np.sum(weights * pressure, axis=1) / np.sum(weights, axis=1)
-    bears.x.array[cells] = np.any(pressure > 0, axis=1)
-    for function in (mean, bears):
+    loaded.x.array[cells] = np.any(pressure > 0, axis=1)
+    for function in (mean, loaded):
         function.x.scatter_forward()
-    smooth = _projected(submesh, [mean], 1, bears, ufl.dx(submesh))
+    smooth = _project(submesh, [mean], 1, loaded, ufl.dx(submesh))
     at_points = PointEvaluator(quadrature, {"pressure": smooth[0]})()["pressure"]
     return global_max(submesh.comm, at_points)
 
 
-def _largest_is_prescribed(problem: ContactProblem, state: Array) -> bool:
+def _is_largest_prescribed(problem: ContactProblem, state: Array) -> bool:
     n = problem.full.unknowns.n_dofs
-    held, size = problem.full.constrained[:n], np.abs(state[:n])
+    prescribed, size = problem.full.constrained[:n], np.abs(state[:n])
     comm = problem.u.function_space.mesh.comm
-    return global_max(comm, size[held]) >= global_max(comm, size[~held])
+    return global_max(comm, size[prescribed]) >= global_max(comm, size[~prescribed])
 
 
-def _smoothed(
+def _project_tensors(
     mesh: dolfinx.mesh.Mesh, tensors: list[Any], degree: int, weight: Any, dx: ufl.Measure
 ) -> list[Any]:
-    """L2 projections of symmetric tensors onto continuous functions of a degree. Collective."""
+    """Project symmetric tensors onto continuous functions of a degree in L². Collective."""
     pairs = [(t, i, j) for t in tensors for i in range(t.ufl_shape[0]) for j in range(i + 1)]
-    found = _projected(mesh, [t[i, j] for t, i, j in pairs], degree, weight, dx)
-    place = {(id(t), i, j): c for c, (t, i, j) in enumerate(pairs)}
+    projected = _project(mesh, [t[i, j] for t, i, j in pairs], degree, weight, dx)
+    index = {(id(t), i, j): c for c, (t, i, j) in enumerate(pairs)}
     return [
         ufl.as_tensor(
             [
-                [found[place[id(t), max(i, j), min(i, j)]] for j in range(t.ufl_shape[0])]
+                [projected[index[id(t), max(i, j), min(i, j)]] for j in range(t.ufl_shape[0])]
                 for i in range(t.ufl_shape[0])
             ]
         )
@@ -503,29 +493,29 @@ def _smoothed(
     ]
 
 
-def _projected(
+def _project(
     mesh: dolfinx.mesh.Mesh, scalars: list[Any], degree: int, weight: Any, dx: ufl.Measure
 ) -> fem.Function:
-    """L2 projections onto continuous functions of a degree, as one vector. Collective.
+    """Project scalars onto continuous functions of a degree in L², as one vector. Collective.
 
-    They vanish at nodes around which the weight is zero.
+    Projections vanish at nodes around which the weight is zero.
     """
     space = fem.functionspace(mesh, ("Lagrange", degree))
     p, q = ufl.TrialFunction(space), ufl.TestFunction(space)
     mass = fem.petsc.assemble_matrix(compile_form(weight * p * q * dx))
     mass.assemble()
-    all_at_once = fem.functionspace(mesh, ("Lagrange", degree, (len(scalars),)))
-    right = fem.Function(all_at_once)
-    form = weight * ufl.dot(ufl.as_vector(scalars), ufl.TestFunction(all_at_once)) * dx
-    assembled(compile_form(form), right.x)
+    blocked = fem.functionspace(mesh, ("Lagrange", degree, (len(scalars),)))
+    rhs = fem.Function(blocked)
+    form = weight * ufl.dot(ufl.as_vector(scalars), ufl.TestFunction(blocked)) * dx
+    assembled(compile_form(form), rhs.x)
     ksp = mass_solver(mass, rtol=1e-8)
-    known, found = fem.Function(space), fem.Function(all_at_once)
+    component, projections = fem.Function(space), fem.Function(blocked)
     for c in range(len(scalars)):
-        known.x.array[:] = right.x.array[c :: len(scalars)]
+        component.x.array[:] = rhs.x.array[c :: len(scalars)]
         solution = fem.Function(space)
-        ksp.solve(known.x.petsc_vec, solution.x.petsc_vec)
+        ksp.solve(component.x.petsc_vec, solution.x.petsc_vec)
         solution.x.scatter_forward()
-        found.x.array[c :: len(scalars)] = solution.x.array
+        projections.x.array[c :: len(scalars)] = solution.x.array
     ksp.destroy()
     mass.destroy()
-    return found
+    return projections
