@@ -18,8 +18,8 @@ class NotConverged(RuntimeError):
         reason: SNES reason of the last attempt.
         verdict: Verification of the last state.
         attempts: The attempts, in their order.
-        prefix: Prefix of the problem's PETSc options.
-        stiffnesses: Names of the stiffness parameters that may be lowered, the first one first.
+        prefix: Prefix of the PETSc options.
+        stiffnesses: Names of the stiffness parameters to lower, in this order.
         driven: Whether a force acts on an obstacle.
 
     Attributes:

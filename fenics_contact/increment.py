@@ -48,8 +48,8 @@ class Increment:
 
     Attributes:
         recover_interior: Whether the interior displacement is recovered after static condensation.
-        points: The iteration for the opposite points of its pairs.
-        start_time: Start of the solution, by `time.perf_counter`.
+        points: The iteration for the opposite points.
+        start_time: Start of the solution, by `time.perf_counter` (s).
         attempts: All attempts in their order.
     """
 
@@ -87,8 +87,7 @@ class IncrementSolver:
     def _check_input(self, *, balance: bool) -> Array:
         """Check the data of the increment, and return its external forces (force). Collective.
 
-        Args:
-            balance: Whether to raise a ValueError for a load that contact cannot balance.
+        With ``balance``, a load that contact cannot balance is a ValueError.
         """
         self.full.bulk.check_finite()
         for contact in self.full.contacts:
@@ -115,10 +114,7 @@ class IncrementSolver:
     ) -> tuple[Trial, Step] | Retry:
         """Solve an increment with its present pairs, on the retained dofs. Collective.
 
-        Args:
-            increment: The increment.
-            state: The committed state.
-            present: The state of the present u.
+        ``present`` is the state of the present u.
 
         Returns:
             The trial state and its `Step`; or the reason to solve the increment again.
@@ -223,13 +219,7 @@ class IncrementSolver:
         return trial, step
 
     def _predict_opposite_points(self, points: OppositePoints, state: State, load: Array) -> None:
-        """Find opposite points at the extrapolated end of the increment. Collective.
-
-        Args:
-            points: The iteration for the opposite points.
-            state: The committed state, with the interior displacement.
-            load: External forces (force).
-        """
+        """Find opposite points at the extrapolated end of the increment. Collective."""
         before = self.full.state()
         points.predict(state, self.full.prescribed_values(), load)
         points.begin(self.full.contacts)
@@ -240,13 +230,7 @@ class IncrementSolver:
     def _choose_pairs(
         self, increment: Increment, contacts: Sequence[Contact], interior: Array | None
     ) -> Retry:
-        """Choose the states in which to find new pairs, from the end of the increment. Collective.
-
-        Args:
-            increment: The increment.
-            contacts: The contacts that need new pairs, evaluated.
-            interior: Vector from which the interior is recovered; None if u is complete.
-        """
+        """Choose the states in which contacts find new pairs, with a complete u. Collective."""
         if interior is not None:
             self.solver.system.complete(interior)
         increment.points.choose_states(contacts, self.full.state())
@@ -337,11 +321,7 @@ class IncrementSolver:
     ) -> tuple[Verdict, Forces]:
         """Verify the increment solved last by `Verifier.verify`. Collective.
 
-        Args:
-            system: The unknowns of the residual.
-            bulk: Residual of the bulk on these (force).
-            initial_unknowns: Unknowns at the beginning; None: see `Verifier.verify`.
-            kinematics: Whether to estimate the small-displacement error.
+        With ``kinematics`` the small-displacement error is estimated.
         """
         equations = self.solver.equations
         return self.verifier.verify(

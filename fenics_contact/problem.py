@@ -58,38 +58,35 @@ class ContactProblem:
 
     `increments` does this for a load history. PETSc's SNES solves in dimensionless unknowns:
     displacements are divided by the size of the mesh, stiffness by the largest diagonal entry of
-    the bulk. Options are read under ``prefix``, for example ``-contact_snes_monitor`` or
-    ``-contact_snes_type newtonls``; the command line takes precedence over ``petsc_options``, and
-    these over the settings of ``method``. The constructor is collective: it compiles the forms and
-    checks the input.
+    the bulk. Options are read under ``prefix``, for example ``-contact_snes_monitor``; the command
+    line takes precedence over ``petsc_options``, and these over the settings of ``method``. The
+    constructor is collective: it compiles the forms and checks the input.
 
     Args:
         F: Residual F(u; v) of the bulk with all loads, without contact.
-        u: Displacement, or a mixed function w of which it is a part, with a pressure for
-            instance; its values are the initial state. The contacts of a mixed function have the
-            displacement of ``ufl.split(w)``.
+        u: Displacement, or a mixed function w with, for instance, a pressure; its values are the
+            initial state. Contacts of a mixed function have the displacement of ``ufl.split(w)``.
         bcs: Dirichlet conditions on ``u`` or its components, or on parts of w.
         contacts: Contacts of ``u``.
         method: "newton": Newton's method with the consistent tangent. "lbfgs": quasi-Newton with
-            H₀ = (K + αK_n + φK_t)⁻¹. "continuation": Newton's method with contact stiffness
-            increased step by step. "primal_dual": primal-dual active set method for friction, with
-            tractions and displacements as unknowns; for small displacements of a linear bulk and
-            obstacles without unknown motions. "alternating": fixed-point iteration on the friction
-            bound; each step is a problem with Tresca friction, solved as a minimisation by Newton's
-            method with a line search on the energy. It is not for mixed functions, whose solutions
-            are saddle points. By default "newton"; for a linear bulk on all unknowns
+            H₀ = (K + αK_n + φK_t)⁻¹. "continuation": Newton's method with increasing contact
+            stiffness. "primal_dual": primal-dual active set method for friction, with tractions and
+            displacements as unknowns, for small displacements of a linear bulk and obstacles
+            without unknown motions. "alternating": fixed-point iteration on the friction bound of
+            Tresca problems, solved as minimisations by Newton's method with a line search on the
+            energy; not for mixed functions. By default "newton"; for a linear bulk on all unknowns
             "lbfgs" by multigrid, and in three dimensions if no bodies slide on each other with
-            finite kinematics. After a failure "primal_dual" follows where it applies,
-            "continuation", and "alternating" where that applies.
+            finite kinematics. After a failure "primal_dual", "continuation" and "alternating"
+            follow where they apply.
         alpha: Factor α of the normal contact stiffness in H₀, 0 to 1 (source paper: 1).
-        phi: Factor φ of the tangential contact stiffness of sticking points in H₀, 0 to 1. The
-            source paper has 0; with 1 a third of the iterations suffices once points stick.
-        fallback: Whether other methods are tried after a failure. They are not tried if an option
-            sets the limit on iterations below its default.
-        condensation: Whether to eliminate the unknowns of a linear bulk that are away from the
-            contact by static condensation, eq. (11). If Γc is large, only the dofs near the active
-            contact zone are retained; they are selected again when it moves or grows. By default
-            it is used if possible and faster, unless an option names a linear solver.
+        phi: Factor φ of the tangential contact stiffness of sticking points in H₀, 0 to 1 (source
+            paper: 0). With 1 a third of the iterations suffices once points stick.
+        fallback: Whether other methods are tried after a failure, unless an option sets the limit
+            on iterations below its default.
+        condensation: Whether to eliminate the dofs of a linear bulk away from the contact by static
+            condensation, eq. (11). If Γc is large, only the dofs near the active contact zone are
+            retained, and selected again when it moves or grows. By default it is used if possible
+            and faster, unless an option names a linear solver.
         linear_solver: "direct" (MUMPS) or "multigrid" (GAMG: one V-cycle as H₀ of L-BFGS, or the
             preconditioner of CG and GMRES in Newton's method), without condensation. By
             default multigrid for three-dimensional problems that it solves faster, and where the
@@ -99,24 +96,22 @@ class ContactProblem:
         prefix: Prefix of the PETSc options.
         small_displacement_tolerance: Largest relative error of the contact force and pressure
             (between two bodies: of the force) due to the assumption of small displacements. An
-            increment with a larger estimate fails, or in which points slide off the places of the
-            other body that their forces act at (`DeformableBody.update_pairs`); from 1 % on there
-            is a warning. With infinity no increment fails for this reason, and none is solved again
-            between other points.
-        cross_check: Whether every solution's contact forces are compared with those that DOLFINx
-            assembles from the boundary form. It costs one compiled form per contact, and one
-            assembly per increment.
+            increment with a larger error fails, or one in which points slide off their opposite
+            points (`DeformableBody.update_pairs`); from 1 % on there is a warning. With infinity no
+            increment fails for this reason, and pairs are not updated within an increment.
+        cross_check: Whether contact forces are compared with those that DOLFINx assembles from the
+            boundary form, at the cost of one form per contact and one assembly per increment.
 
     Attributes:
         u: The function that is solved for: the displacement, or a mixed function.
-        displacement: The relation of the displacement to u.
+        displacement: The displacement as a part of u.
         contacts: The contacts.
         motions: The rigid-body modes of the bodies, and which of them are free.
         solver: The solver of an increment: system, methods and SNES.
         accuracy: The strictest `Accuracy` of the contacts; None if any contact has none.
         increment: Number of committed increments.
-        initial_penetration: Largest penetration of the undeformed body (length), 0 if none. An
-            interference prescribed by ``gap`` does not count.
+        initial_penetration: Largest penetration of the undeformed body (length), without an
+            interference prescribed by ``gap``.
 
     Raises:
         ValueError: Invalid input; raised on all ranks.
@@ -229,7 +224,7 @@ class ContactProblem:
     def small_displacement_tolerance(self) -> float:
         """Largest relative error accepted of the small-displacement assumption; settable.
 
-        It limits the errors of contact force and pressure, between two bodies that of the force.
+        It limits the errors of contact force and pressure, between two bodies of the force only.
         """
         return self._increments.verifier.small_displacement_tolerance
 
@@ -241,9 +236,8 @@ class ContactProblem:
     def expected_increments(self) -> int:
         """Number of increments that the choice of the linear solver assumes, 4 unless it is set.
 
-        `increments` sets it. Set it before the first solution (collective) where a loop of your own
-        solves many increments in three dimensions: static condensation pays for many of them,
-        multigrid for few. After the first solution it has no effect.
+        `increments` sets it. Set it (collective) before the first solution of your own loop over
+        many increments: static condensation pays for many of them, multigrid for few.
         """
         return self.solver.expected_increments
 
@@ -290,8 +284,8 @@ class ContactProblem:
 
         Returns:
             For a ``with`` block, a collective function that returns the change of this rank's
-            unknowns. Its argument is either the tractions added on the body, one array (n_points,
-            gdim) per contact, or None: then the right-hand side is the present residual.
+            unknowns due to tractions added on the body, one array (n_points, gdim) per contact, or
+            for None due to the present residual.
         """
         self.complete()
         return self.solver.linearised(springs, self._present.load)
@@ -307,19 +301,16 @@ class ContactProblem:
         Args:
             recover_interior: Whether to recover the interior displacement after static
                 condensation. If False, u away from the contact may remain that of an earlier
-                increment; the results of all contacts are those of this one, and the verification
-                is that of the condensed equations. `complete` recovers the interior, for 1/15 to
-                1/30 of the cost of a factorisation. If only a part of Γc is retained, the interior
-                is always recovered, to verify that the rest of Γc is open.
+                increment, and the condensed equations are verified. `complete` recovers the
+                interior, for 1/15 to 1/30 of the cost of a factorisation. If only a part of Γc is
+                retained, the interior is always recovered, to verify that the rest is open.
 
         Returns:
             The `Step`, with the verdict.
 
         Raises:
-            NotConverged: No solution was found, or it failed the verification; u and history are
-                unchanged.
-            ValueError: The input is not finite or out of range, or no contact force can balance
-                the load.
+            NotConverged: There is no verified solution; u and history are unchanged.
+            ValueError: The input is not finite or out of range, or contact cannot balance the load.
         """
         check_bool("recover_interior", recover_interior)
         updates_pairs = self.small_displacement_tolerance < np.inf
@@ -437,9 +428,8 @@ class ContactProblem:
     def complete(self) -> Verdict | None:
         """Recover the interior displacement of the increment solved last. Collective.
 
-        It is needed after `solve` or `increments` with ``recover_interior``. The field is verified
-        independently: the product of the bulk's matrix with it must balance loads and contact
-        forces.
+        It is needed after `solve` or `increments` with ``recover_interior``. The product of the
+        bulk's matrix with the field must balance loads and contact forces.
 
         Returns:
             The verdict; None if u was complete.
@@ -488,8 +478,7 @@ class ContactProblem:
         """Make the solved state the start of the next increment, with its history. Collective.
 
         The committed state is the one that `solve` found, even if constants or u have been changed
-        since. Without a solution since the last commit there is no effect. If the commit fails,
-        the history is unchanged.
+        since. There is no effect without a new solution; if the commit fails, none on the history.
         """
         if self._trial is None:
             return
@@ -524,10 +513,7 @@ class ContactProblem:
         self._trial = None
 
     def restore(self) -> None:
-        """Discard an increment that was not committed: u is reset to the last commit. Collective.
-
-        The history changes at `commit` only.
-        """
+        """Discard an uncommitted increment, and reset u to the last commit. Collective."""
         self._trial = None
         self._reset_to(self.state.unknowns)
 

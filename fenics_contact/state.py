@@ -21,10 +21,8 @@ class State:
         load: External forces at the unknowns (force).
         energy: Forces and energies.
         load_change: Change of the external forces in the last increment (force).
-        change: Change of the unknowns in the last increment (length); None before the first one, or
-            if the interior was out of date.
-        interior: Vector from which the interior displacement is recovered after static
-            condensation; None if the unknowns are complete.
+        change: Change of the unknowns in the last increment (length), None if unknown.
+        interior: Vector that recovers the interior displacement; None if it is up to date.
         increment: Number of committed increments.
     """
 

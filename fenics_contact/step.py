@@ -34,10 +34,9 @@ class Step:
         attempts: All attempts in their order; the last one found the solution.
         wall_seconds: Time of the solve on this rank (s).
         load: Load parameter, if the step was made by `increments`.
-        increment_error: Accumulated error of the increment size, by quantity of `ErrorBudget`, with
+        increment_error: Accumulated error of the increment size by quantity of `ErrorBudget`, with
             ``increments(estimate=True)``.
-        complete: Whether all of u is up to date; if not, `ContactProblem.complete` recovers the
-            interior displacement.
+        complete: Whether the interior displacement is up to date; see `ContactProblem.complete`.
     """
 
     increment: int

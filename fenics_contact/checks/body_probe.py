@@ -27,7 +27,7 @@ __all__ = ["OpposingBodyProbe"]
 class OpposingBodyProbe:
     """Positions on Γc (slave) and on the opposing surface (master) in the deformed bodies.
 
-    The constructor traces the present normals of both surfaces to the other one. It is collective.
+    The constructor is collective: it traces the present normals of both surfaces to the other one.
 
     Args:
         before: Displacement at the last commit; None: paths are not verified.
@@ -82,10 +82,7 @@ class OpposingBodyProbe:
     def _with_lost(self, surface: _Surface, hits: Hits, deepest: float) -> Hits:
         """Trace positions without a hit that were inside of the other body further. Collective.
 
-        Args:
-            surface: The surface with the positions.
-            hits: Hits of rays that are as long as the largest penetration of the points.
-            deepest: Penetration of the points at the last commit (length).
+        ``deepest`` is the largest penetration of the points at the last commit (length).
         """
         lost = np.flatnonzero(np.isnan(hits.distance))
         if self._before is None or not self._comm.allreduce(len(lost)):
@@ -135,11 +132,7 @@ class OpposingBodyProbe:
         return np.where(paired, depth, 0.0), allowed
 
     def _tangent_planes(self, resisted: Array) -> tuple[Array, Array]:
-        """Gather `tangent_planes_around` of the master surface for all ranks' facets. Collective.
-
-        Args:
-            resisted: Penetration at the points that the law resists, (n_points,) (length).
-        """
+        """Gather `tangent_planes_around` of the master surface at all facets. Collective."""
         n, slave = self._rows.size, self._slave
         ray, normal = slave.normal[:n], _normals(self._slave_hits)[:n]
         through = slave.place[:n] + self._slave_hits.distance[:n, None] * ray
@@ -151,13 +144,10 @@ class OpposingBodyProbe:
         return through, normal
 
     def crossed(self, allowed: Array) -> Array:
-        """Return the undeformed positions that crossed the other surface. Collective.
+        """Return the undeformed positions that crossed the other surface, (n, gdim). Collective.
 
         A position has crossed if it entered through a facet and is deeper than is allowed at the
         end, or has left the body through its opposite side.
-
-        Returns:
-            Array (n, gdim) (length).
         """
         if self._before is None:
             return self.x[:0]
@@ -199,11 +189,8 @@ class _Surface:
     def trace(self, rays: Rays, some: Index, u: fem.Function, deep: Array) -> Hits:
         """Trace the normals of the surface to the other one. Collective.
 
-        Args:
-            rays: The rays between both surfaces.
-            some: Indices of the positions, (m,).
-            u: Displacement of the bodies.
-            deep: Penetration bound of every facet of the surface (length).
+        ``some`` has the indices of the positions, (m,), ``deep`` the penetration bound of every
+        facet of the surface (length).
         """
         facet, reference = self.facet[some], self.reference[some]
         facets = self.side.facets
@@ -261,10 +248,7 @@ class _Surface:
 
 
 def _depth(hits: Hits, surface: _Surface) -> Array:
-    """Return the depth of positions below the surface hit by their normals, (n,) (length).
-
-    It is NaN without a hit. A grazing ray is longer than its origin is deep.
-    """
+    """Return the depth below the surface hit by the normals, (n,) (length), NaN without a hit."""
     return -hits.distance * abs(dot(_normals(hits), surface.normal))
 
 

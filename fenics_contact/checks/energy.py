@@ -27,8 +27,7 @@ class Energy:
 
     Works are products of the mean force at both ends of the increment and the displacement between
     them. The loads are F at u = 0, and internal forces the rest of F. In a form with inertia both
-    contain a part of the inertial forces, so that ``work`` and ``elastic`` are neither the work of
-    the loads nor the elastic energy; their difference and all other attributes remain valid.
+    have a part of the inertial forces; the difference of ``work`` and ``elastic`` remains valid.
 
     Attributes:
         work: Work of the loads, of Dirichlet values and of moving obstacles.
@@ -38,15 +37,13 @@ class Energy:
         remainder: work - elastic - springs - dissipation: due to contact that changes within the
             increment, which decreases with its size, and to springs released where contact opens.
         friction: Work of friction on the body over the slip, by the mean of the tractions at both
-            ends: negative where friction brakes. It is positive if slip reverses within a long
-            increment, or if the state is not reached by smaller increments.
+            ends, normally negative. It is positive if slip reverses within a long increment, or if
+            the state is not reached by smaller increments.
         sliding: Upper bound of the frictional work, by magnitudes of tractions and slip.
-        imbalance: Work minus elastic minus the work of the tractions on Γc, which vanishes by
-            equilibrium at both ends up to the solver's tolerance. Between bodies whose opposite
-            points change (finite kinematics, or sliding) it only decreases with the increment size.
-        friction_energy_gain: Energy that friction has supplied, relative to the energy exchanged,
-            the largest over groups of interacting bodies; 0 if none. Where works cancel in a
-            reversal within one increment, it is relative to ``sliding``.
+        imbalance: Work minus elastic minus the work of the tractions on Γc, zero by equilibrium at
+            both ends. If opposite points change, it decreases with the increment size.
+        friction_energy_gain: Energy supplied by friction relative to the energy exchanged, or to
+            ``sliding`` if works cancel: the largest over groups of interacting bodies.
     """
 
     work: float

@@ -119,8 +119,7 @@ def check_contacts(
     """Check names, motions and free dofs of the contacts. Collective.
 
     Raises:
-        ValueError: Contacts share a name or an unknown motion, or all dofs of a facet of Γc are
-            prescribed; raised on all ranks.
+        ValueError: On all ranks, for equal names or motions, or a fully prescribed facet of Γc.
     """
     names = [c.name for c in contacts]
     if len(set(names)) != len(names):
@@ -170,15 +169,13 @@ def _count_constrained_facets(contact: Contact, constrained: Array) -> int:
 def check_undeformed_geometry(contacts: Sequence[Contact]) -> float:
     """Check the undeformed geometry and the input of the contacts. Collective.
 
-    Warns of initial penetration, of too few quadrature points, and of obstacles that two contacts
-    have in common: these make forces wrong.
+    Warns of penetration, of too few quadrature points, and of obstacles of two contacts.
 
     Returns:
-        Largest penetration of the undeformed body (length), without an interference prescribed by
-        ``gap``; 0 if there is none.
+        Largest penetration of the undeformed body (length), without a prescribed interference.
 
     Raises:
-        ValueError: Input out of range, or an obstacle inside of the body; raised on all ranks.
+        ValueError: Input out of range, or an obstacle inside of the body; on all ranks.
     """
     worst = 0.0
     for contact in contacts:
@@ -210,10 +207,7 @@ def check_undeformed_geometry(contacts: Sequence[Contact]) -> float:
 
 
 def _check_obstacle_outside(contact: Contact) -> None:
-    """Raise a ValueError if a rigid obstacle is inside of the undeformed body. Collective.
-
-    Only bodies whose Γc all faces away from the obstacle are concerned.
-    """
+    """Raise a ValueError if an obstacle is inside of a body whose Γc faces away. Collective."""
     if contact.contact_kinematics.sampler is None:
         return
     mesh, values, places = contact.surface.mesh, contact.values, contact.facet_places

@@ -76,7 +76,7 @@ def traction_change(stiffness: Array, jump: Array) -> Array:
 def _slip_rotation_stiffness(contact: Contact) -> Array:
     """Return the stiffness due to rotation of the slip direction, (n_points, gdim, gdim).
 
-    It is zero in two dimensions. Polygonal friction cones are approximated by elliptic ones.
+    It is zero in the plane. Polygonal friction cones are approximated by elliptic ones.
     """
     values, d = contact.values, contact.values.normal.shape[1]
     stiffness: Array = np.zeros((len(values.normal), d, d))
@@ -231,12 +231,7 @@ class Deviation:
         return cls(gap, normal_change, normal, lost, closing)
 
     def linearised(self, contact: Contact) -> tuple[Array, Array]:
-        """Linearise the contact in the deformed bodies.
-
-        Returns:
-            The stiffness, (n_points, gdim, gdim), as of `spring_stiffness`, and the change of the
-            tractions at fixed displacements, (n_points, gdim) (stress).
-        """
+        """Return stiffness and traction change at fixed displacements in the deformed bodies."""
         traction, values = contact.traction, contact.values
         k_n = np.where(self.closing, contact.normal_stiffness, 0.0)
         added = k_n[:, None, None] * np.einsum("qi,qj->qij", self.normal, self.normal)
@@ -327,11 +322,8 @@ def _relative_errors(
 ) -> tuple[float, float]:
     """Return the relative errors of force and pressure of a group. Collective.
 
-    Args:
-        contact: The evaluated contact.
-        group: The group of its points.
-        added: Change of the tractions at fixed displacements, (n_points, gdim) (stress).
-        response: Change of the tractions due to displacements, (n_points, gdim) (stress).
+    Tractions change by ``added`` at fixed displacements, and by ``response`` due to displacements,
+    (n_points, gdim) each (stress).
     """
     comm, (own, unloaded) = contact.surface.mesh.comm, group
     measure = contact.measure[own]

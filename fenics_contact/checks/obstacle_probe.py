@@ -113,13 +113,11 @@ class RigidObstacleProbe:
         )
 
     def _deepest(self) -> tuple[Index, Array, Array, Array]:
-        """Find the positions on facets that are closest to the obstacle. Collective.
-
-        Alternating projections onto obstacle and facet start from all sampling positions.
+        """Find the closest positions to the obstacle by alternating projections. Collective.
 
         Returns:
             Facet, reference coordinates, distance (length), and unit normal towards the obstacle,
-            (n, ...), of the sampling positions and all iterates.
+            (n, ...), of the sampling positions and of all iterates.
         """
         places, size = self.places, self.places.size
         facet, reference, rows = places.facet, places.reference, places.rows.ravel()
@@ -167,9 +165,8 @@ class RigidObstacleProbe:
 
         The probe of an obstacle that rotates or changes its shape is not valid again.
         """
-        valid = (
-            np.array_equal(self._shape, self.sampler.shape) and not contact.contact_kinematics.turns
-        )
+        valid = np.array_equal(self._shape, self.sampler.shape)
+        valid = valid and not contact.contact_kinematics.turns
         displacement = self._at(self._in_frame(contact, contact.u)) - self.z
         size = self.places.size[self.facet]
         clearance = DEPTH_RESOLUTION * size + self.distance
@@ -198,8 +195,8 @@ class RigidObstacleProbe:
     def _protrusion(self, allowed: Array, size: Array) -> Array:
         """Return how far the obstacle protrudes into the body, (n,) (length). Collective.
 
-        In an obstacle that is narrower than a facet the distance to its surface is short even if it
-        has pierced Γc. Its tip is searched along the normal of Γc.
+        The distance to the surface of a narrow obstacle is short even if it has pierced Γc. Its tip
+        is searched along the normal of Γc.
         """
         depth = -self.distance
         index = np.flatnonzero((depth > 0) & (depth <= allowed))
@@ -232,9 +229,8 @@ class RigidObstacleProbe:
     def crossed(self, allowed: Array) -> Array:
         """Return the undeformed positions that crossed the obstacle in the increment. Collective.
 
-        Γc moves along straight lines, while the obstacle rotates, and the constants in its distance
-        change, at constant rates. A rotation by more than a right angle is divided into parts: the
-        obstacle may have passed through the body and be outside of it again at the end.
+        Γc moves along straight lines, the obstacle rotates and changes its shape at constant rates.
+        A rotation by more than a right angle is divided, as it may have led through the body.
         """
         n = max(1, int(np.ceil(abs(self.rotation.angle) / _MAX_ROTATION_PER_PART)))
         parts = [self._crossed_between(k / n, (k + 1) / n, allowed) for k in range(n)]
@@ -324,12 +320,8 @@ class RigidObstacleProbe:
     ) -> Index:
         """Find the flat pieces of Γc through which points entered the body before. Collective.
 
-        Args:
-            points: Points of the obstacle, in its frame, (n, gdim) (length).
-            facet: This rank's facet that is nearest to each, (n,).
-            outward: Outward unit normal of the facet, (n, gdim).
-            some: Mask of the points concerned, (n,).
-            field: Nodes of Γc in that frame, (n_nodes, gdim) (length).
+        For each point of the obstacle, in its frame, ``facet`` is the nearest one of this rank, and
+        ``outward`` its unit normal. The mask ``some`` selects points.
 
         Returns:
             Global numbers of the pieces, (n,); -1 for points that are outside, or below another
@@ -353,9 +345,8 @@ class RigidObstacleProbe:
         Args:
             start: Positions in the frame of the obstacle at the first time, (n, gdim) (length).
             end: Positions in its frame at the last time, (n, gdim) (length).
-            entered: Which points are inside of the body, (n,); points that enter are added.
-            through: Global number of the flat piece of Γc through which each has entered the body,
-                (n,), -1 for points outside; updated.
+            entered: Mask of the points that have been inside of the body, (n,); updated.
+            through: Global number of the piece of Γc that each has entered, (n,), else -1; updated.
             times: Times between which Γc moves along straight lines in the obstacle's frame.
         """
         vertices = np.full((len(start), 1), -1)
@@ -371,11 +362,8 @@ class RigidObstacleProbe:
     def _find_passages(self, start: Array, end: Array, since: float, until: float) -> Mask:
         """Return which paths lead through the obstacle, by bisection. Collective.
 
-        Args:
-            start: Positions in the frame of the obstacle at ``since``, (n, gdim) (length).
-            end: Positions in its frame at ``until``, (n, gdim) (length).
-            since: First time in the increment, from 0 to 1.
-            until: Last time in the increment, from 0 to 1.
+        ``start`` and ``end`` are positions in the frame of the obstacle at two times from 0 to 1,
+        (n, gdim) (length).
         """
         passes = np.zeros(len(start), dtype=np.bool_)
         if not self.comm.allreduce(len(start)):
@@ -404,11 +392,8 @@ class RigidObstacleProbe:
     ) -> Array:
         """Find the facets below which points are deeper than is allowed. Collective.
 
-        Args:
-            points: Points of the obstacle, in its frame, (n, gdim) (length).
-            field: Nodes of Γc in that frame, (n_nodes, gdim) (length).
-            through: Global number of the piece of Γc that each has entered, (n,); -1 if outside.
-            allowed: Allowed depth at this rank's positions, (n_places,) (length).
+        For each point of the obstacle, in its frame, ``through`` is the global number of the piece
+        of Γc that it has entered, -1 if it is outside.
 
         Returns:
             Midpoints of the facets on the undeformed Γc, (m, gdim) (length).

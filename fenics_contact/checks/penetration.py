@@ -50,13 +50,7 @@ class ResistedDepth:
 
     @classmethod
     def of(cls, comm: MPI.Comm, vertices: Sequence[Index], depth: Sequence[Array]) -> ResistedDepth:
-        """Gather the penetration at the facets of all ranks. Collective.
-
-        Args:
-            comm: Communicator.
-            vertices: Corners of this rank's facets, (n, n_corners) each.
-            depth: Penetration of these facets, (n,) each (length).
-        """
+        """Gather the depth (n,) at facets with corners (n, n_corners) of all ranks. Collective."""
         number: Any = np.zeros(0, dtype=np.int64)
         value: Any = np.zeros(0)
         for corners, depths in zip(vertices, depth, strict=True):
@@ -111,14 +105,9 @@ def tangent_planes_around(
 
 
 def depth_below(place: Array, through: Array, normal: Array) -> Array:
-    """Return the largest depth of positions (n, d) below m planes, (n,) (length).
+    """Return the largest depth of positions (n, d) below planes, (n,) (length); -inf without any.
 
-    It is -inf without any plane.
-
-    Args:
-        place: The positions.
-        through: A position in each plane, (n, m, d), NaN without a plane.
-        normal: Outward unit normals of the planes, (n, m, d).
+    ``through`` has a position in each plane, (n, m, d), NaN without one, ``normal`` the normals.
     """
     depth = -np.einsum("nqd,nqd->nq", place[:, None] - through, normal)
     return np.where(np.isnan(depth), -np.inf, depth).max(axis=1, initial=-np.inf)

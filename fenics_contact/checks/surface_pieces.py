@@ -45,12 +45,8 @@ class SurfacePieces:
     ) -> SurfacePieces:
         """Gather the pieces of all ranks. Collective.
 
-        Args:
-            comm: Communicator.
-            places: The sampling positions of Γc.
-            field: Positions of the nodes of Γc, (n_nodes, gdim) (length).
-            facet: This rank's facet of each sampling position, (n,).
-            allowed: Allowed depth there, (n,) (length).
+        The nodes of Γc are at ``field``, (n_nodes, gdim) (length). ``allowed`` has the allowed
+        depth at positions on ``facet``, (n,) (length).
         """
         most: Array = np.zeros(len(places.size))
         np.maximum.at(most, facet, allowed)
@@ -63,12 +59,8 @@ class SurfacePieces:
     def is_shallow(self, points: Array, normal: Array) -> Mask:
         """Return whether points are within the allowed depth below an adjacent face. Collective.
 
-        Near an edge of the body a point deep below one face may have hardly entered through the
-        other one. Opposite faces do not count: a point close to them has passed through the body.
-
-        Args:
-            points: Positions, (n, gdim) (length).
-            normal: Outward unit normal of the facet that each is deep below, (n, gdim).
+        Near an edge of the body a point deep below one facet, with the outward unit ``normal``, may
+        have hardly entered through the other one. Faces opposite to the facet do not count.
         """
         depth = -np.einsum("nmd,md->nm", points[:, None] - self.corner, self.normal)
         near = (depth >= 0) & (depth <= self.allowed)

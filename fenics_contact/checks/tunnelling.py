@@ -100,14 +100,7 @@ class TunnellingCheck:
         self._last: dict[str, Any] = {}
 
     def evaluate(self, before: fem.Function | None) -> dict[str, Tunnelling]:
-        """Verify the contacts at the end of an increment. Collective.
-
-        Args:
-            before: Displacement at the last commit; None: paths are not verified.
-
-        Returns:
-            The result by name of the contact.
-        """
+        """Verify the evaluated contacts, and their paths from the state ``before``. Collective."""
         if not self._contacts:
             return {}
         comm = self._contacts[0].surface.mesh.comm

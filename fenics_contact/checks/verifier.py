@@ -31,7 +31,7 @@ _REPEATED_WARNING_FACTOR = 2.0
 
 
 class Verifier:
-    """Verifies evaluated states of a problem.
+    """Verification of evaluated states of a problem.
 
     Attributes:
         small_displacement_tolerance: Largest relative error accepted of forces and pressures.
@@ -55,7 +55,7 @@ class Verifier:
         self._warned_resolution: set[tuple[str, str]] = set()
         products = np.array([motions.by_body(full, motion) for motion in motions.of_bodies])
         products = np.moveaxis(products, 0, 2)
-        # A body of one node has no rotations.
+        # The pseudo-inverse serves bodies of one node, without rotations.
         self._inverse = np.linalg.pinv(global_sum(self._comm, products), hermitian=True)
 
     def verify(
@@ -71,8 +71,8 @@ class Verifier:
         """Recompute residual, balance and laws at evaluated contacts. Collective.
 
         Args:
-            system: The unknowns of the residual.
-            bulk: Residual of the bulk on these (force).
+            system: The system of the unknowns.
+            bulk: Residual of the bulk (force).
             start: Forces at the beginning of the increment.
             rtol: Residual accepted, relative to the forces.
             initial_unknowns: Unknowns at the beginning; None: laws, rigid obstacles and paths are
@@ -186,14 +186,11 @@ class Verifier:
 
         The integral is the sum over the quadrature points, not over nodal forces.
 
-        Args:
-            system: The unknowns.
-            internal: Residual of the bulk without reactions, (n_local,).
-            forces: All forces, for their magnitude, (n_local,) each.
+        ``internal`` is the residual of the bulk without reactions, (n_local,).
 
         Returns:
             The sums, (n_bodies, n_per_body) (force), as of `RigidBodyModes.work`; the number of
-            unknowns and the sum of absolute forces of every body, (2, n_bodies).
+            unknowns and the sum of the absolute ``forces`` of every body, (2, n_bodies).
         """
         total = self._motions.by_body(system, internal)
         n = len(total)

@@ -1,8 +1,4 @@
-"""Adaptive mesh refinement by stress recovery, for meshes of straight-sided simplices.
-
-Each level solves the whole load history, estimates the error of every cell, and refines the cells
-with the largest errors.
-"""
+"""Adaptive refinement of meshes of straight-sided simplices by stress recovery."""
 
 from __future__ import annotations
 

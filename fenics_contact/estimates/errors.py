@@ -61,9 +61,8 @@ class ErrorBudget:
             could not be estimated has no entry.
         wanted: The relative error of the contacts' `Accuracy`; None without one.
         h: Mean size of the facets under pressure (length).
-        across: Approximate number of facets under pressure in a row: their number in two
-            dimensions, its square root in three. Below five the estimate of the discretisation
-            error is unreliable.
+        across: Approximate number of facets under pressure in a row. Below five the estimate of the
+            discretisation error is unreliable.
         degree: Degree of the displacement element.
         energy: Relative discretisation error in the energy norm.
         cells: Squares of the discretisation error of the cells that this rank owns (force times
@@ -88,8 +87,8 @@ class ErrorBudget:
     def h_wanted(self) -> float:
         """Size of facets that the accuracy wanted requires, at most the present one (length).
 
-        Since the pressure has a square-root singularity at the end of contact, forces converge at
-        most like h³ and pressures like h^(3/2), whatever the degree.
+        Due to the square-root singularity at the end of contact, forces converge at most like h³
+        and pressures like h^(3/2).
         """
         if self.wanted is None:
             return self.h
@@ -109,10 +108,7 @@ class ErrorBudget:
 
     @property
     def total(self) -> dict[str, float]:
-        """Relative errors of all sources together, by quantity: the root of the sum of squares.
-
-        The sources are independent, and their signs are not all known.
-        """
+        """Relative errors of all sources together, by quantity: the root of the sum of squares."""
         squares = dict.fromkeys(self.values, 0.0)
         for part in self.parts:
             for name, error in self.relative(part).items():
@@ -183,9 +179,8 @@ def estimate_errors(
 ) -> ErrorBudget:
     """Estimate the errors of the last solution by source, before or after its commit. Collective.
 
-    Errors of contact forces, peak pressures and displacement are estimated by linearisation and
-    stress recovery; the estimates are not bounds. The cost is a factorisation of the tangent (a
-    dense one of a condensed problem) and a projection of stress and strain.
+    The estimates, by linearisation and stress recovery, are not bounds. They cost a factorisation
+    of the tangent (a dense one of a condensed problem) and a projection of stress and strain.
 
     Args:
         problem: A problem that has been solved; its state does not change.
@@ -300,9 +295,8 @@ def _linearised_errors(
         errors["solver"] = differences(solve(None), [np.zeros_like(s) for s in penalty_jumps])
         # One augmentation leaves 1/(1 + k_n h/E) of the error at the shortest wavelengths, and far
         # less at the long ones that determine forces.
-        change = solve(
-            [traction_change(*both) for both in zip(springs, penalty_jumps, strict=True)]
-        )
+        added = [traction_change(k, j) for k, j in zip(springs, penalty_jumps, strict=True)]
+        change = solve(added)
         errors["enforcement"] = differences(change, penalty_jumps)
     deformed = [Deviation.of(contact).linearised(contact) for contact in contacts]
     with problem.linearised([k for k, _ in deformed]) as solve:
@@ -314,12 +308,9 @@ def _linearised_errors(
 
 
 def _penalty_jump(contact: Contact) -> Array:
-    """Return the jump due to the penalty, projected onto displacements of Γc. Collective.
+    """Return the jump due to the penalty, projected onto Γc, (n_points, gdim) (length). Collective.
 
     It is zero if the stiffness is physical.
-
-    Returns:
-        Array (n_points, gdim) (length).
     """
     law, values, normal = contact.law, contact.values, contact.values.normal
     jump = np.zeros_like(normal)
