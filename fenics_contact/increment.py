@@ -188,7 +188,7 @@ class IncrementSolver:
             return self._choose_pairs(increment, outdated, interior)
         energy = None
         if reason > 0 and not verdict.failures:
-            energy = self._energy(state, energies, points)
+            energy = self._compute_energy(state, energies, points)
             verdict = replace(verdict, friction_energy_gain=energy.friction_energy_gain)
         if energy is None or verdict.failures:
             if points.drop_prediction():
@@ -274,7 +274,9 @@ class IncrementSolver:
 
     # ---- verification ----------------------------------------------------------------------------
 
-    def _energy(self, state: State, energies: EnergyState, points: OppositePoints) -> Energy:
+    def _compute_energy(
+        self, state: State, energies: EnergyState, points: OppositePoints
+    ) -> Energy:
         """Return the energies of the increment from a committed state. Collective."""
         start, coordinate_id = state.energy, self.solver.system.coordinate_id
         if self.full.coordinate_id not in energies.forces and coordinate_id not in start.forces:
@@ -282,8 +284,8 @@ class IncrementSolver:
             zero = Forces.none(np.zeros(1), np.zeros(1, dtype=np.intp))
             start = start.with_forces(coordinate_id, zero)
         if points.replaced:
-            start = start.between(self.full.contacts)
-        return energies.since(start, self.full.contacts, self.full.scales)
+            start = start.with_committed_jumps(self.full.contacts)
+        return energies.compute_energy(start, self.full.contacts, self.full.scales)
 
     def _verify_all(
         self, initial_unknowns: Array, *, kinematics: bool, assemble: bool

@@ -355,7 +355,8 @@ class ContactProblem:
                     reset()
                     self._restore_committed_pairs()
                     points.begin(self.contacts)
-                    # Outside of the block, in which a new SNES would read the solver's own options.
+                    # After the block, in which a new SNES would take the solver's options for the
+                    # user's.
                     if result is Retry.UNKNOWNS:
                         count = sum(each.outcome == result.value for each in increment.attempts)
                         self.solver.change(anew=count <= 1)
@@ -504,7 +505,7 @@ class ContactProblem:
             unknowns=self.full.state(),
             contacts=tuple(contact.states.committed for contact in self.contacts),
             load=trial.load,
-            energy=trial.energy.between(self.contacts),
+            energy=trial.energy.with_committed_jumps(self.contacts),
             change=trial.unknowns - start.unknowns if complete else None,
             load_change=trial.load - start.load,
             interior=trial.interior,
@@ -600,7 +601,7 @@ class ContactProblem:
             unknowns=state.copy(),
             contacts=tuple(contact.states.committed for contact in self.contacts),
             load=load,
-            energy=energy.between(self.contacts),
+            energy=energy.with_committed_jumps(self.contacts),
             change=change.copy() if global_max(self._comm, np.abs(change)) else None,
             load_change=load_change.copy(),
             increment=increment,

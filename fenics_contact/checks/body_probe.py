@@ -31,7 +31,7 @@ class OpposingBodyProbe:
 
     Args:
         before: Displacement at the last commit; None: paths are not verified.
-        known: The probe up to which paths are verified, if there is one.
+        earlier: The probe up to which paths are verified, if there is one.
 
     Attributes:
         x: Undeformed positions, those of Γc first, (n, gdim) (length).
@@ -41,12 +41,15 @@ class OpposingBodyProbe:
     """
 
     def __init__(
-        self, contact: Contact, before: fem.Function | None, known: OpposingBodyProbe | None = None
+        self,
+        contact: Contact,
+        before: fem.Function | None,
+        earlier: OpposingBodyProbe | None = None,
     ) -> None:
         search = contact.pairs.search
         assert search is not None
         self._search, self.u = search, contact.u.copy()
-        self._before = before if known is None else known.u
+        self._before = before if earlier is None else earlier.u
         self._comm = contact.surface.mesh.comm
         self._rows = contact.quadrature.point_rows
         values = contact.values
@@ -59,8 +62,8 @@ class OpposingBodyProbe:
         everywhere, n_facets = np.arange(len(self._master.facet)), len(self._master.side.body)
         hits = self._master.trace(search.rays, everywhere, self.u, np.full(n_facets, deepest))
         before = global_max(self._comm, contact.history.values("penetration"))
-        self._slave_hits = self._with_lost(self._slave, present.hits, before)
-        self._master_hits = self._with_lost(self._master, hits, before)
+        self._slave_hits = self._extend_hits(self._slave, present.hits, before)
+        self._master_hits = self._extend_hits(self._master, hits, before)
         self.x = np.concatenate([self._slave.undeformed, self._master.undeformed])
         n = contact.quadrature.n_points
         gap, partner = self._slave_hits.distance[:n], self._slave_hits.facet[:n]
@@ -79,7 +82,7 @@ class OpposingBodyProbe:
         heights = np.concatenate([slave.height, master.height])
         self._clearance = global_min(self._comm, np.append(clearance, heights))
 
-    def _with_lost(self, surface: _Surface, hits: Hits, deepest: float) -> Hits:
+    def _extend_hits(self, surface: _Surface, hits: Hits, deepest: float) -> Hits:
         """Trace positions without a hit that were inside of the other body further. Collective.
 
         ``deepest`` is the largest penetration of the points at the last commit (length).
@@ -135,15 +138,15 @@ class OpposingBodyProbe:
         """Gather `tangent_planes_around` of the master surface at all facets. Collective."""
         n, slave = self._rows.size, self._slave
         ray, normal = slave.normal[:n], _normals(self._slave_hits)[:n]
-        through = slave.place[:n] + self._slave_hits.distance[:n, None] * ray
+        origin = slave.place[:n] + self._slave_hits.distance[:n, None] * ray
         normal = normal * -np.sign(dot(normal, ray))[:, None]
         corners = slave.side.corners[slave.side.own]
-        planes = through[self._rows], normal[self._rows]
+        planes = origin[self._rows], normal[self._rows]
         planes = tangent_planes_around(self._comm, corners, resisted[self._rows], *planes)
-        through, normal = (gather_rows(self._comm, v) for v in planes)
-        return through, normal
+        origin, normal = (gather_rows(self._comm, v) for v in planes)
+        return origin, normal
 
-    def crossed(self, allowed: Array) -> Array:
+    def find_crossed(self, allowed: Array) -> Array:
         """Return the undeformed positions that crossed the other surface, (n, gdim). Collective.
 
         A position has crossed if it entered through a facet and is deeper than is allowed at the
@@ -155,7 +158,7 @@ class OpposingBodyProbe:
         # The mean translation of both surfaces is removed.
         shift = global_mean(self._comm, slave.place - slave.at(self._before))
         masks = [
-            one.crossed(self._before, shift, other, allowed[part], _depth(hits, one))
+            one.find_crossed(self._before, shift, other, allowed[part], _depth(hits, one))
             for one, other, part, hits in (
                 (slave, master, slice(n), self._slave_hits),
                 (master, slave, slice(n, None), self._master_hits),
@@ -186,10 +189,10 @@ class _Surface:
         """Return the positions in the bodies displaced by u, (n, gdim) (length)."""
         return self.side.facets.positions(self.facet, self.reference, u)[0]
 
-    def trace(self, rays: Rays, some: Index, u: fem.Function, deep: Array) -> Hits:
+    def trace(self, rays: Rays, some: Index, u: fem.Function, bound: Array) -> Hits:
         """Trace the normals of the surface to the other one. Collective.
 
-        ``some`` has the indices of the positions, (m,), ``deep`` the penetration bound of every
+        ``some`` has the indices of the positions, (m,), ``bound`` the penetration bound of every
         facet of the surface (length).
         """
         facet, reference = self.facet[some], self.reference[some]
@@ -199,19 +202,19 @@ class _Surface:
             reference,
             facets.normals(facet, reference, u),
             u,
-            deep,
+            bound,
             back=self.side is rays.there,
             undeformed=facets.normals(facet, reference),
             before=u,  # for the tangents
         )
 
-    def moving(self, before: fem.Function, shift: Array) -> MovingFacets:
+    def moving_facets(self, before: fem.Function, shift: Array) -> MovingFacets:
         """Return this rank's facets in the increment, with their start moved by a shift."""
         side, facets = self.side, self.side.facets
         start, end = facets.moved_corners(before) + shift, facets.moved_corners(self._u)
         return MovingFacets(start, end, facets.outward, side.vertices[side.own])
 
-    def crossed(
+    def find_crossed(
         self, before: fem.Function, shift: Array, other: _Surface, allowed: Array, depth: Array
     ) -> Mask:
         """Return which positions have crossed the other surface, (n,). Collective.
@@ -227,7 +230,7 @@ class _Surface:
         """
         vertices = self.side.vertices[self.number]
         start = self.at(before) + shift
-        facets = other.moving(before, shift)
+        facets = other.moving_facets(before, shift)
         hits = find_crossings(self._comm, start, self.place, vertices, facets)
         crossed = np.zeros(len(self.facet), dtype=np.bool_)
         n = len(hits.place)
@@ -238,9 +241,9 @@ class _Surface:
         entry = np.where(hits.inward[first][:, None], hits.normal[first], -self.normal[place])
         crossed[place] = leaves & (dot(entry, hits.normal[last]) < OPPOSITE_SIDES)
         penetrates = depth[place] >= 0  # compared with the allowed depth elsewhere
-        deep = ~leaves & ~penetrates & (hits.depth[last] > allowed[place])
+        is_too_deep = ~leaves & ~penetrates & (hits.depth[last] > allowed[place])
         # A position that slides sideways off the body is deep below a facet that it has left.
-        index, since = place[deep], hits.time[last][deep]
+        index, since = place[is_too_deep], hits.time[last][is_too_deep]
         ends = start[index], self.place[index]
         path = largest_depth_on_path(self._comm, *ends, since, vertices[index], facets)
         crossed[index] |= path > allowed[index]

@@ -92,7 +92,7 @@ class EnergyState:
         """Return this state with the forces in additional coordinates."""
         return dataclasses.replace(self, forces={**self.forces, coordinate_id: forces})
 
-    def between(self, contacts: Sequence[Contact]) -> EnergyState:
+    def with_committed_jumps(self, contacts: Sequence[Contact]) -> EnergyState:
         """Return this committed state with the committed jumps of the contacts' present pairs."""
         rows = [
             np.stack([row[0], contact.contact_kinematics.committed_jump, *row[2:]])
@@ -100,7 +100,7 @@ class EnergyState:
         ]
         return dataclasses.replace(self, contacts=rows)
 
-    def since(
+    def compute_energy(
         self, before: EnergyState, contacts: Sequence[Contact], scales: ReferenceScales
     ) -> Energy:
         """Return the energies between the state ``before`` and this one. Collective."""
@@ -151,9 +151,9 @@ class EnergyState:
                 acts = sizes > scales.round_off_at_points(number, sizes)
                 weight, length = 0.5 * contact.measure * acts, np.sqrt(_dot(slip, slip))
                 for traction in ends:
-                    side = traction - _dot(traction, normal)[:, None] * normal
-                    add(5, weight * _dot(side, slip), groups)
-                    add(6, weight * (np.sqrt(_dot(side, side)) * length), groups)
+                    tangential = traction - _dot(traction, normal)[:, None] * normal
+                    add(5, weight * _dot(tangential, slip), groups)
+                    add(6, weight * (np.sqrt(_dot(tangential, tangential)) * length), groups)
         sums = scales.global_sum(sums)
         sums[5, np.abs(sums[5]) <= _NEGLIGIBLE_WORK_RATIO * sums[7]] = 0.0
         work, elastic, springs, dissipation, tractions, friction, sliding, _ = map(

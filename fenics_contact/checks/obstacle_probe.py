@@ -43,7 +43,7 @@ class RigidObstacleProbe:
 
     Args:
         before: Displacement at the last commit; None if unknown.
-        known: The probe up to which paths are verified, if there is one.
+        earlier: The probe up to which paths are verified, if there is one.
 
     Attributes:
         x: Positions on the undeformed Γc, (n, gdim) (length).
@@ -65,7 +65,7 @@ class RigidObstacleProbe:
         self,
         contact: Contact,
         before: fem.Function | None = None,
-        known: RigidObstacleProbe | None = None,
+        earlier: RigidObstacleProbe | None = None,
     ) -> None:
         kinematics, values = contact.contact_kinematics, contact.values
         assert kinematics.sampler is not None
@@ -78,15 +78,15 @@ class RigidObstacleProbe:
         self._shape = self.sampler.shape
         self.rotation = kinematics.rotation_in_increment(values)
         self.field = self._in_frame(contact, contact.u)
-        if known is not None and not kinematics.turns:
-            self.start = known.field
+        if earlier is not None and not kinematics.turns:
+            self.start = earlier.field
         else:
             self.start = places.at_nodes(
                 values.x + kinematics.committed_jump,
                 contact.u if before is None else before,
                 lambda rest: kinematics.in_frame(rest, kinematics.committed_angle),
             )
-        self.facet, self.reference, self.distance, self.toward = self._deepest()
+        self.facet, self.reference, self.distance, self.toward = self._find_deepest()
         self.x, _ = places.facets.positions(self.facet, self.reference)
         self.z = self._at(self.field)
         # Tangent planes predict the displacement as far as the points carry it.
@@ -96,8 +96,8 @@ class RigidObstacleProbe:
         resisted = np.maximum(values.penetration, np.where(closed, -self._gap, 0.0))[places.rows]
         corners = places.facets.corner_vertices()
         self.resisted = [(corners, resisted.max(axis=1, initial=0.0))]
-        through = self.points + self._gap[:, None] * self._normal
-        planes = through[places.rows], -self._normal[places.rows]
+        origins = self.points + self._gap[:, None] * self._normal
+        planes = origins[places.rows], -self._normal[places.rows]
         self._planes = tangent_planes_around(self.comm, corners, resisted, *planes)
 
     def _in_frame(self, contact: Contact, u: fem.Function | None) -> Array:
@@ -112,7 +112,7 @@ class RigidObstacleProbe:
             lambda rest: kinematics.in_frame(rest, kinematics.angle(values)),
         )
 
-    def _deepest(self) -> tuple[Index, Array, Array, Array]:
+    def _find_deepest(self) -> tuple[Index, Array, Array, Array]:
         """Find the closest positions to the obstacle by alternating projections. Collective.
 
         Returns:
@@ -123,8 +123,13 @@ class RigidObstacleProbe:
         facet, reference, rows = places.facet, places.reference, places.rows.ravel()
         between = places.values(self.field, facet[rows.size :], reference[rows.size :])
         # The quadrature points, which come first, are sampled already.
-        known, more = (self._gap[rows], self._normal[rows]), self.sampler.sample(between)
-        distance, normal = (np.concatenate(both) for both in zip(known, more, strict=True))
+        sampled, between_samples = (
+            (self._gap[rows], self._normal[rows]),
+            self.sampler.sample(between),
+        )
+        distance, normal = (
+            np.concatenate(pair) for pair in zip(sampled, between_samples, strict=True)
+        )
         iterates = [(facet, reference, distance, normal)]
         # An obstacle farther away than the size of a facet does not reach it.
         going: Mask = distance < size[facet]
@@ -186,8 +191,8 @@ class RigidObstacleProbe:
         planes = depth_below(self._carried_by_points, *(p[self.facet] for p in self._planes))
         size = places.size[self.facet]
         allowed = allowed_depth(around, planes, size, size)
-        # Deeper in a flat cell another surface may be nearer, and `_entered_before` would not find
-        # the facet of entry.
+        # Deeper in a flat cell another surface may be nearer, and the facet of entry would not be
+        # found.
         limit = np.where(around > 0, np.inf, places.facets.heights()[self.facet] / 2)
         allowed = np.minimum(allowed, limit)
         return self._protrusion(allowed, size), allowed
@@ -226,14 +231,14 @@ class RigidObstacleProbe:
             depth[index] = reach
         return depth
 
-    def crossed(self, allowed: Array) -> Array:
+    def find_crossed(self, allowed: Array) -> Array:
         """Return the undeformed positions that crossed the obstacle in the increment. Collective.
 
         Γc moves along straight lines, the obstacle rotates and changes its shape at constant rates.
         A rotation by more than a right angle is divided, as it may have led through the body.
         """
         n = max(1, int(np.ceil(abs(self.rotation.angle) / _MAX_ROTATION_PER_PART)))
-        parts = [self._crossed_between(k / n, (k + 1) / n, allowed) for k in range(n)]
+        parts = [self._find_crossed_between(k / n, (k + 1) / n, allowed) for k in range(n)]
         return np.concatenate(parts)
 
     def _at(self, field: Array) -> Array:
@@ -247,7 +252,7 @@ class RigidObstacleProbe:
         end = self.rotation.turned(self.field, 1.0)
         return self.rotation.turned(self.start + time * (end - self.start), -time)
 
-    def _crossed_between(self, since: float, until: float, allowed: Array) -> Array:
+    def _find_crossed_between(self, since: float, until: float, allowed: Array) -> Array:
         """Return the undeformed positions that cross the obstacle between two times. Collective.
 
         The points of the obstacle that are nearest to positions of Γc at either time are followed.
@@ -286,36 +291,38 @@ class RigidObstacleProbe:
         closest = start + distance[:, None] * normal, end + distance_end[near, None] * toward
         points = points_end = np.concatenate(closest)
         if changed:
-            points = np.concatenate([closest[0], self._nearest(closest[1], since)])
-            points_end = np.concatenate([self._nearest(closest[0], until), closest[1]])
+            points = np.concatenate([closest[0], self._project_onto_obstacle(closest[1], since)])
+            points_end = np.concatenate(
+                [self._project_onto_obstacle(closest[0], until), closest[1]]
+            )
         facet, size = self.facet[near], size[near]
         inward, inward_end = -self.places.outward(field)[facet], -outward_end[facet]
         inside = dot(normal, inward) * distance > 0
         entered = np.append(inside & (distance < 0), np.zeros(len(near), dtype=np.bool_))
-        through = np.full(len(points), -1)
-        through[: len(near)] = self._entered_before(
+        entry = np.full(len(points), -1)
+        entry[: len(near)] = self._find_entry_pieces(
             closest[0], facet, -inward, inside & (distance >= 0), field
         )
         # Over a time dt a path deviates from its chord by at most |x''| dt² / 8.
         acceleration = (angle**2 * radius + 2 * angle * path)[near] / size
         n = int(np.ceil(np.sqrt(global_max(comm, acceleration) / (8 * DEPTH_RESOLUTION))))
         times: Any = np.linspace(since, until, max(n, 1) + 1)
-        self._follow_points(points, points_end, entered, through, times)
-        middles = self._find_pierced_facets(points_end, field_end, through, allowed)
+        self._follow_points(points, points_end, entered, entry, times)
+        middles = self._find_pierced_facets(points_end, field_end, entry, allowed)
         opposite = np.flatnonzero(dot(normal, toward) < OPPOSITE_SIDES)
-        # Along the path the tangent planes are not known.
+        # Along the path the tangent planes are unknown.
         depth = (allowed[near] + PREDICTED_DEPTH * size)[:, None]
         start, end = start + depth * inward, end + depth * inward_end
-        passed = self._find_passages(start[opposite], end[opposite], since, until)
-        passed |= entered[opposite]
-        return np.concatenate([middles, self.x[near[opposite[passed]]]])
+        passes = self._find_passages(start[opposite], end[opposite], since, until)
+        passes |= entered[opposite]
+        return np.concatenate([middles, self.x[near[opposite[passes]]]])
 
-    def _nearest(self, points: Array, time: float) -> Array:
+    def _project_onto_obstacle(self, points: Array, time: float) -> Array:
         """Return the nearest points of the obstacle at a time from 0 to 1. Collective."""
         distance, normal = self.sampler.sample(points, time)
         return points + distance[:, None] * np.nan_to_num(normal)
 
-    def _entered_before(
+    def _find_entry_pieces(
         self, points: Array, facet: Index, outward: Array, some: Mask, field: Array
     ) -> Index:
         """Find the flat pieces of Γc through which points entered the body before. Collective.
@@ -327,18 +334,18 @@ class RigidObstacleProbe:
             Global numbers of the pieces, (n,); -1 for points that are outside, or below another
             surface of a thin body.
         """
-        through = np.full(len(points), -1)
+        entry = np.full(len(points), -1)
         if self.comm.allreduce(int(some.any())):
             size, height = self.places.size[facet[some]], self.places.facets.heights()
             reach = np.minimum(ALLOWED_BEFORE * size, height[facet[some]] / 2)
             facets = self.places.moving_facets(field, field)
-            _, through[some] = depth_below_surface(
+            _, entry[some] = depth_below_surface(
                 self.comm, points[some], outward[some], reach, facets
             )
-        return through
+        return entry
 
     def _follow_points(
-        self, start: Array, end: Array, entered: Mask, through: Index, times: Array
+        self, start: Array, end: Array, entered: Mask, entry: Index, times: Array
     ) -> None:
         """Follow points of the obstacle through the facets of Γc. Collective.
 
@@ -346,7 +353,7 @@ class RigidObstacleProbe:
             start: Positions in the frame of the obstacle at the first time, (n, gdim) (length).
             end: Positions in its frame at the last time, (n, gdim) (length).
             entered: Mask of the points that have been inside of the body, (n,); updated.
-            through: Global number of the piece of Γc that each has entered, (n,), else -1; updated.
+            entry: Global number of the piece of Γc that each has entered, (n,), else -1; updated.
             times: Times between which Γc moves along straight lines in the obstacle's frame.
         """
         vertices = np.full((len(start), 1), -1)
@@ -357,7 +364,7 @@ class RigidObstacleProbe:
             hits = find_crossings(self.comm, points[k], points[k + 1], vertices, facets)
             entered[hits.place[hits.inward]] = True
             final = np.append(np.diff(hits.place) > 0, True)[: len(hits.place)]
-            through[hits.place[final]] = np.where(hits.inward, hits.facet, -1)[final]
+            entry[hits.place[final]] = np.where(hits.inward, hits.facet, -1)[final]
 
     def _find_passages(self, start: Array, end: Array, since: float, until: float) -> Mask:
         """Return which paths lead through the obstacle, by bisection. Collective.
@@ -388,24 +395,24 @@ class RigidObstacleProbe:
         return passes
 
     def _find_pierced_facets(
-        self, points: Array, field: Array, through: Index, allowed: Array
+        self, points: Array, field: Array, entry: Index, allowed: Array
     ) -> Array:
         """Find the facets below which points are deeper than is allowed. Collective.
 
-        For each point of the obstacle, in its frame, ``through`` is the global number of the piece
+        For each point of the obstacle, in its frame, ``entry`` is the global number of the piece
         of Γc that it has entered, -1 if it is outside.
 
         Returns:
             Midpoints of the facets on the undeformed Γc, (m, gdim) (length).
         """
-        if not self.comm.allreduce(int((through >= 0).any())):
+        if not self.comm.allreduce(int((entry >= 0).any())):
             return self.x[:0]
         surface = SurfacePieces.of(self.comm, self.places, field, self.facet, allowed)
-        depth = -dot(points - surface.corner[through], surface.normal[through])
-        rows = np.flatnonzero((through >= 0) & (depth > surface.allowed[through]))
-        normal = surface.normal[through[rows]]
+        depth = -dot(points - surface.corner[entry], surface.normal[entry])
+        rows = np.flatnonzero((entry >= 0) & (depth > surface.allowed[entry]))
+        normal = surface.normal[entry[rows]]
         reach = 2 * depth[rows]
         depth, facet = depth_below_surface(self.comm, points[rows], normal, reach, surface.facets)
-        deep = (facet >= 0) & (depth > surface.allowed[facet])
-        deep &= ~surface.is_shallow(points[rows], normal)
-        return np.asarray(surface.middle[np.unique(facet[deep])])
+        is_too_deep = (facet >= 0) & (depth > surface.allowed[facet])
+        is_too_deep &= ~surface.is_shallow(points[rows], normal)
+        return np.asarray(surface.middle[np.unique(facet[is_too_deep])])

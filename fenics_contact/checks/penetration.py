@@ -72,7 +72,7 @@ class ResistedDepth:
 
 
 def tangent_planes_around(
-    comm: MPI.Comm, corners: Index, resisted: Array, through: Array, normal: Array
+    comm: MPI.Comm, corners: Index, resisted: Array, origin: Array, normal: Array
 ) -> tuple[Array, Array]:
     """Collect the obstacle's tangent planes at a facet's points and around its corners. Collective.
 
@@ -83,7 +83,7 @@ def tangent_planes_around(
         comm: Communicator.
         corners: Global numbers of the vertices of this rank's facets, (n, n_corners).
         resisted: Penetration at their points that the law resists, (n, n_points) (length).
-        through: A position in the plane of each point, (n, n_points, gdim) (length).
+        origin: A position in the plane of each point, (n, n_points, gdim) (length).
         normal: Outward unit normal of the plane, (n, n_points, gdim).
 
     Returns:
@@ -91,7 +91,7 @@ def tangent_planes_around(
     """
     n, n_corners = corners.shape
     deepest = (np.arange(n), resisted.argmax(axis=1)) if n else (np.arange(0), np.arange(0))
-    rows = np.column_stack([-resisted[deepest], through[deepest], normal[deepest]])
+    rows = np.column_stack([-resisted[deepest], origin[deepest], normal[deepest]])
     has_plane = (rows[:, 0] < 0) & ~np.isnan(rows).any(axis=1)
     table = np.repeat(rows[has_plane], n_corners, axis=0)
     table = gather_rows(comm, np.column_stack([corners[has_plane].ravel(), table]))
@@ -101,15 +101,15 @@ def tangent_planes_around(
     index = np.searchsorted(vertices, corners)
     index[np.append(vertices, np.nan)[index] != corners] = len(vertices)
     around = np.split(table[index], 2, axis=2)
-    return np.append(through, around[0], axis=1), np.append(normal, around[1], axis=1)
+    return np.append(origin, around[0], axis=1), np.append(normal, around[1], axis=1)
 
 
-def depth_below(place: Array, through: Array, normal: Array) -> Array:
+def depth_below(positions: Array, origin: Array, normal: Array) -> Array:
     """Return the largest depth of positions (n, d) below planes, (n,) (length); -inf without any.
 
-    ``through`` has a position in each plane, (n, m, d), NaN without one, ``normal`` the normals.
+    ``origin`` has a position in each plane, (n, m, d), NaN without one, ``normal`` the normals.
     """
-    depth = -np.einsum("nqd,nqd->nq", place[:, None] - through, normal)
+    depth = -np.einsum("nqd,nqd->nq", positions[:, None] - origin, normal)
     return np.where(np.isnan(depth), -np.inf, depth).max(axis=1, initial=-np.inf)
 
 

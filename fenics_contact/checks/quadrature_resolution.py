@@ -30,19 +30,19 @@ def warn_of_few_points(contact: Contact) -> bool:
         return False
     per_radius = curvature * quadrature.facet_sizes
     nodes = POINTS_PER_RADIUS * contact.displacement.degree * per_radius
-    few = nodes > _MAX_NODES_PER_POINT * (quadrature.degree // 2 + 1)
+    coarse = nodes > _MAX_NODES_PER_POINT * (quadrature.degree // 2 + 1)
     force = contact.measure * contact.pressure
-    unresolved, whole = global_sum(comm, [force @ few, force.sum()])
+    unresolved, whole = global_sum(comm, [force @ coarse, force.sum()])
     if not unresolved > _UNRESOLVED_FORCE_RATIO * whole:
         return False
-    most = global_max(comm, per_radius[few & (contact.pressure > 0)])
+    length = global_max(comm, per_radius[coarse & (contact.pressure > 0)])
     points = quadrature.default_degree(contact.displacement.degree) + 2
     warn(
         comm,
         f"{contact.name}: facets of Γc with {percent(unresolved / whole)} of the normal force are "
-        f"{most:.2g} times as long as the radius of curvature of the obstacle, which their "
+        f"{length:.2g} times as long as the radius of curvature of the obstacle, which their "
         "quadrature points do not resolve: the force is inaccurate. Use smaller facets, or "
-        f"ContactSurface(quadrature_degree={round(POINTS_PER_RADIUS * most) * points - 2})",
+        f"ContactSurface(quadrature_degree={round(POINTS_PER_RADIUS * length) * points - 2})",
     )
     return True
 

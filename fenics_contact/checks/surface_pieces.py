@@ -48,11 +48,11 @@ class SurfacePieces:
         The nodes of Γc are at ``field``, (n_nodes, gdim) (length). ``allowed`` has the allowed
         depth at positions on ``facet``, (n,) (length).
         """
-        most: Array = np.zeros(len(places.size))
-        np.maximum.at(most, facet, allowed)
+        bound: Array = np.zeros(len(places.size))
+        np.maximum.at(bound, facet, allowed)
         facets, middles = places.moving_facets(field, field), places.piece_middles()
-        most = np.repeat(most, len(middles) // max(len(most), 1))
-        table = np.column_stack([most, facets.start[:, 0], facets.normals(), middles])
+        bound = np.repeat(bound, len(middles) // max(len(bound), 1))
+        table = np.column_stack([bound, facets.start[:, 0], facets.normals(), middles])
         table = gather_rows(comm, table)
         return cls(comm, facets, table[:, 0], *np.split(table[:, 1:], 3, axis=1))
 

@@ -51,8 +51,8 @@ class Tunnelling:
         """Verify one contact, given the penetration that all contacts resist. Collective."""
         depth, allowed = probe.depth(resisted)
         worst = _find_worst(comm, depth - allowed, np.column_stack([depth, allowed, probe.x]))
-        through = probe.crossed(allowed)
-        crossed = _find_worst(comm, np.ones(len(through)), through)
+        positions = probe.find_crossed(allowed)
+        crossed = _find_worst(comm, np.ones(len(positions)), positions)
         return cls(
             depth=0.0 if worst is None else float(worst[0]),
             allowed=0.0 if worst is None else float(worst[1]),
@@ -62,22 +62,22 @@ class Tunnelling:
 
     def conditions(self, contact: str) -> list[Condition]:
         """Return the conditions on a contact of this name."""
-        deep = (
+        too_deep = (
             f"{contact}: the obstacle penetrates between the quadrature points of Γc, by "
             f"{self.depth:.3e} near {place_in_words(self.place or [])} in the undeformed body, "
             f"where the points around allow {self.allowed:.3e}; refine Γc there or give "
             "ContactSurface a larger quadrature_degree; between two bodies let the finer surface "
             "be Γc, or add a second contact with the surfaces swapped"
         )
-        through = (
+        has_crossed = (
             f"{contact}: in one increment a part of Γc has crossed the obstacle, at "
             f"{place_in_words(self.crossed or [])} in the undeformed body; load in smaller steps "
             "(increments() cuts them by itself), and include in Γc and in the opposite surface all "
             "sides that may touch"
         )
         return [
-            Condition(f"penetration between points, {contact}", self.depth, self.allowed, deep),
-            Condition(f"tunnelling, {contact}", float(self.crossed is not None), 0.0, through),
+            Condition(f"penetration between points, {contact}", self.depth, self.allowed, too_deep),
+            Condition(f"tunnelling, {contact}", float(self.crossed is not None), 0.0, has_crossed),
         ]
 
 
@@ -107,14 +107,14 @@ class TunnellingCheck:
         probes, renewed = {}, []
         for contact in self._contacts:
             name = contact.name
-            known = None if before is None else self._committed_probe(contact, before)
-            if known is not None and known.is_valid_for(contact):
-                probes[name] = known
+            earlier = None if before is None else self._committed_probe(contact, before)
+            if earlier is not None and earlier.is_valid_for(contact):
+                probes[name] = earlier
                 continue
             probe: _Probe = (
-                RigidObstacleProbe(contact, before, known)
+                RigidObstacleProbe(contact, before, earlier)
                 if contact.rigid
-                else OpposingBodyProbe(contact, before, known)
+                else OpposingBodyProbe(contact, before, earlier)
             )
             probes[name] = probe
             renewed.append(name)

@@ -333,8 +333,8 @@ def check_laws(contact: Contact) -> dict[str, float]:
         elastic = v.parameters["k_n"] * (v.normal_displacement - v.initial_gap)
         violations.append(relative(worst(r_n + elastic), *pressure))
     elif law.has_normal_stiffness and contact.multipliers is not None:
-        slack = -r_n - v.multiplier - v.parameters["k_n"] * -gap
-        violations.append(relative(worst(np.minimum(-r_n, slack)), v.multiplier, *pressure))
+        complement = -r_n - v.multiplier - v.parameters["k_n"] * -gap
+        violations.append(relative(worst(np.minimum(-r_n, complement)), v.multiplier, *pressure))
     elif law.has_normal_stiffness:
         elastic = v.parameters["k_n"] * v.penetration
         violations.append(relative(worst(np.maximum(r_n, 0), r_n + elastic), *pressure))
