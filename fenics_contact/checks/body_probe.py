@@ -31,7 +31,7 @@ class OpposingBodyProbe:
 
     Args:
         before: Displacement at the last commit; None: paths are not verified.
-        earlier: The probe up to which paths are verified, if there is one.
+        committed: Probe of a committed state, up to which paths are verified.
 
     Attributes:
         x: Undeformed positions, those of Γc first, (n, gdim) (length).
@@ -44,12 +44,12 @@ class OpposingBodyProbe:
         self,
         contact: Contact,
         before: fem.Function | None,
-        earlier: OpposingBodyProbe | None = None,
+        committed: OpposingBodyProbe | None = None,
     ) -> None:
         search = contact.pairs.search
         assert search is not None
         self._search, self.u = search, contact.u.copy()
-        self._before = before if earlier is None else earlier.u
+        self._before = before if committed is None else committed.u
         self._comm = contact.surface.mesh.comm
         self._rows = contact.quadrature.point_rows
         values = contact.values

@@ -43,7 +43,7 @@ class RigidObstacleProbe:
 
     Args:
         before: Displacement at the last commit; None if unknown.
-        earlier: The probe up to which paths are verified, if there is one.
+        committed: Probe of a committed state, up to which paths are verified.
 
     Attributes:
         x: Positions on the undeformed Γc, (n, gdim) (length).
@@ -65,7 +65,7 @@ class RigidObstacleProbe:
         self,
         contact: Contact,
         before: fem.Function | None = None,
-        earlier: RigidObstacleProbe | None = None,
+        committed: RigidObstacleProbe | None = None,
     ) -> None:
         kinematics, values = contact.contact_kinematics, contact.values
         assert kinematics.sampler is not None
@@ -78,8 +78,8 @@ class RigidObstacleProbe:
         self._shape = self.sampler.shape
         self.rotation = kinematics.rotation_in_increment(values)
         self.field = self._in_frame(contact, contact.u)
-        if earlier is not None and not kinematics.turns:
-            self.start = earlier.field
+        if committed is not None and not kinematics.turns:
+            self.start = committed.field
         else:
             self.start = places.at_nodes(
                 values.x + kinematics.committed_jump,
@@ -123,21 +123,13 @@ class RigidObstacleProbe:
         facet, reference, rows = places.facet, places.reference, places.rows.ravel()
         between = places.values(self.field, facet[rows.size :], reference[rows.size :])
         # The quadrature points, which come first, are sampled already.
-        sampled, between_samples = (
-            (self._gap[rows], self._normal[rows]),
-            self.sampler.sample(between),
-        )
-        distance, normal = (
-            np.concatenate(pair) for pair in zip(sampled, between_samples, strict=True)
-        )
+        samples = (self._gap[rows], self._normal[rows]), self.sampler.sample(between)
+        distance, normal = (np.concatenate(pair) for pair in zip(*samples, strict=True))
         iterates = [(facet, reference, distance, normal)]
         # An obstacle farther away than the size of a facet does not reach it.
         going: Mask = distance < size[facet]
         scale: Array = np.ones(len(facet))
-        inverse, near = (
-            np.swapaxes(self.places.tangents(self.field), 1, 2),
-            np.unique(facet[going]),
-        )
+        inverse, near = np.swapaxes(places.tangents(self.field), 1, 2), np.unique(facet[going])
         inverse[near] = np.linalg.pinv(np.swapaxes(inverse[near], 1, 2))
         for _ in range(_MAX_DESCENT_STEPS):
             facet, reference, scale = facet[going], reference[going], scale[going]
@@ -291,10 +283,8 @@ class RigidObstacleProbe:
         closest = start + distance[:, None] * normal, end + distance_end[near, None] * toward
         points = points_end = np.concatenate(closest)
         if changed:
-            points = np.concatenate([closest[0], self._project_onto_obstacle(closest[1], since)])
-            points_end = np.concatenate(
-                [self._project_onto_obstacle(closest[0], until), closest[1]]
-            )
+            points = np.concatenate([closest[0], self._project_points(closest[1], since)])
+            points_end = np.concatenate([self._project_points(closest[0], until), closest[1]])
         facet, size = self.facet[near], size[near]
         inward, inward_end = -self.places.outward(field)[facet], -outward_end[facet]
         inside = dot(normal, inward) * distance > 0
@@ -317,7 +307,7 @@ class RigidObstacleProbe:
         passes |= entered[opposite]
         return np.concatenate([middles, self.x[near[opposite[passes]]]])
 
-    def _project_onto_obstacle(self, points: Array, time: float) -> Array:
+    def _project_points(self, points: Array, time: float) -> Array:
         """Return the nearest points of the obstacle at a time from 0 to 1. Collective."""
         distance, normal = self.sampler.sample(points, time)
         return points + distance[:, None] * np.nan_to_num(normal)

@@ -107,14 +107,14 @@ class TunnellingCheck:
         probes, renewed = {}, []
         for contact in self._contacts:
             name = contact.name
-            earlier = None if before is None else self._committed_probe(contact, before)
-            if earlier is not None and earlier.is_valid_for(contact):
-                probes[name] = earlier
+            committed = None if before is None else self._committed_probe(contact, before)
+            if committed is not None and committed.is_valid_for(contact):
+                probes[name] = committed
                 continue
             probe: _Probe = (
-                RigidObstacleProbe(contact, before, earlier)
+                RigidObstacleProbe(contact, before, committed)
                 if contact.rigid
-                else OpposingBodyProbe(contact, before, earlier)
+                else OpposingBodyProbe(contact, before, committed)
             )
             probes[name] = probe
             renewed.append(name)

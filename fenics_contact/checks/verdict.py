@@ -23,9 +23,8 @@ __all__ = ["ForceBalance", "Verdict", "check_laws"]
 _LAW_TOLERANCE = 1e-10
 # Round-off of coordinates and tractions relative to their magnitude, divided by that tolerance.
 _SCALED_ROUND_OFF_RATIO = 16 * np.finfo(float).eps / _LAW_TOLERANCE
-# Energy supplied by friction relative to the energy exchanged. It is 6 % by the mean of the
-# tractions at both ends if a tangential load is reversed in one increment, and half or more in
-# states that smaller increments do not lead to.
+# Energy supplied by friction relative to the energy exchanged: 6 % if a tangential load is reversed
+# in one increment, half or more in states that smaller increments do not lead to.
 _MAX_FRICTION_ENERGY_GAIN = 0.25
 # Displacement without rigid-body motion, half of the relative one of the ends, by the body's size.
 _MAX_DEFORMATION_RATIO = 5.0
@@ -105,7 +104,7 @@ class Verdict:
             tractions at the quadrature points, not by nodal forces.
         laws: By contact and condition, the largest relative violation of the contact law.
         enforcement: By contact with multipliers, its `Contact.enforcement_error`.
-        enforcement_tolerance: By contact with multipliers, the largest enforcement error accepted.
+        enforcement_tolerance: By contact with multipliers, the largest such error accepted.
         obstacles: By contact with a rigid obstacle, distance gradient, depth and rotation.
         tunnelling: By contact, the penetration between the quadrature points, and the points that
             have crossed the obstacle.
@@ -115,8 +114,8 @@ class Verdict:
             body may deform by more than five times its size.
         deformation: By body, the largest displacement without rigid-body motion, divided by the
             size of the body or the range of its Dirichlet values, whichever is larger.
-        ejected_bodies: By body without contact force that is ejected its displacement, the largest
-            one accepted, and the largest displacement nearby (length).
+        ejected_bodies: By ejected body, its displacement, the largest displacement accepted, and
+            the largest one nearby (length).
         friction_energy_gain: Energy supplied by friction, relative to the energy exchanged.
         inverted: Whether cells of a nonlinear bulk are inverted, det(I + grad u) ≤ 0.
         cross_check: By contact, the largest difference of its nodal forces from those that DOLFINx
@@ -361,8 +360,7 @@ def check_laws(contact: Contact) -> dict[str, float]:
     # Open points have neither traction nor slip.
     closed = bound > 0
     slip = -np.einsum("qm,qmd->qd", beta, gradients)
-    # The round-off of the slip is that of the displacements, and that of the traction divided by
-    # the stiffness.
+    # Slip has the round-off of displacements, and of tractions divided by the stiffness.
     size = np.linalg.norm(tau, axis=1)
     elastic_slip = np.divide(size, stiffest, out=np.zeros_like(size), where=stiffest > 0)
     travel = (v.jump, v.increment, change, round_off, _SCALED_ROUND_OFF_RATIO * elastic_slip)
