@@ -135,8 +135,8 @@ class IncrementSolver:
         stiffness_changed = self.full.update_stiffness()
         if stiffness_changed and self.full.bulk.linear:
             self.modulus.measure()
-        approach = InitialPositioning(self.full, solver.equations.motions, load, before)
-        cold = approach.lead(first=state.increment == 0)
+        positioning = InitialPositioning(self.full, solver.equations.motions, load, before)
+        cold = positioning.lead(first=state.increment == 0)
         if solver.select_dofs():
             return Retry.UNKNOWNS
         solver.update_system(stiffness_changed)
