@@ -191,7 +191,7 @@ def test_every_error_is_told() -> None:
         "OSError(text)",
         "SystemExit(main())",
         "ValueError(f'{name}: {error}')",
-        "self._not_converged(state, reason, verdict, increment.tried)",
+        "self._not_converged(state, reason, verdict, increment.attempts)",
     ]
     assert len(told) > 200
 
