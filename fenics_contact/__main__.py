@@ -1,4 +1,4 @@
-"""What this installation is made of: ``python -m fenics_contact info``."""
+"""Print the versions and features of this installation: ``python -m fenics_contact info``."""
 
 from __future__ import annotations
 
@@ -12,21 +12,17 @@ from fenics_contact.installation import information
 __all__ = ["main"]
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Print it on the first rank, as the words of the command line say. Collective.
-
-    Returns:
-        0, for the shell.
-    """
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command of the command line and return the exit status 0. Collective."""
     parser = argparse.ArgumentParser(prog="python -m fenics_contact", description=__doc__)
     parser.add_argument(
-        "command", choices=["info"], help="info: versions, solvers, what is missing"
+        "command", choices=["info"], help="info: versions, solvers, missing packages"
     )
-    parser.parse_args(words)
-    found = information()
+    parser.parse_args(arguments)
+    entries = information()
     if MPI.COMM_WORLD.rank == 0:
-        width = max(map(len, found))
-        print("\n".join(f"{name:<{width}}  {text}" for name, text in found.items()), flush=True)
+        width = max(map(len, entries))
+        print("\n".join(f"{name:<{width}}  {text}" for name, text in entries.items()), flush=True)
     return 0
 
 

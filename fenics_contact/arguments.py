@@ -1,4 +1,4 @@
-"""Checks of arguments, before any work: an error that says what was given and what is expected."""
+"""Checks of arguments; the errors state what was given and what is expected."""
 
 from __future__ import annotations
 
@@ -17,36 +17,28 @@ __all__ = [
     "listed",
 ]
 
-_CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
+_CELL_TYPES = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 
 
 def check_bool(name: str, value: Any) -> None:
-    """Refuse what is neither True nor False, of Python or NumPy.
-
-    Raises:
-        ValueError: It names the argument, what it is, and what it must be.
-    """
+    """Raise ValueError unless an argument is True or False (Python or NumPy)."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name} is {value!r}; it must be True or False")
 
 
 def check_cells(name: str, kind: str) -> None:
-    """Refuse cells whose facets are not all alike, as those of prisms and pyramids.
-
-    Raises:
-        ValueError: It says which cells are taken.
-    """
-    if kind not in _CELLS:
-        raise ValueError(f"{name} has cells of type {kind}; use one of {_CELLS}")
+    """Raise ValueError for cells with facets of several types, such as prisms and pyramids."""
+    if kind not in _CELL_TYPES:
+        raise ValueError(f"{name} has cells of type {kind}; use one of {_CELL_TYPES}")
 
 
 def is_built_in(item: object) -> bool:
-    """Whether its class is one of this package, and not of a user."""
+    """Return whether the class of an object belongs to this package."""
     return type(item).__module__.split(".")[0] == __name__.split(".")[0]
 
 
 def is_number(value: Any) -> bool:
-    """Whether it is a real number, of Python or NumPy; a text or a truth value is none."""
+    """Return whether a value is a real number (Python or NumPy), not a string or bool."""
     if not isinstance(value, int | float | np.number | np.ndarray):
         return False
     return np.ndim(value) == 0 and np.asarray(value).dtype.kind in "iuf"
@@ -55,31 +47,25 @@ def is_number(value: Any) -> bool:
 def check_positive(
     name: str,
     value: Any,
-    what: str = "a number greater than zero",
+    expected: str = "a number greater than zero",
     *,
     infinite: bool = False,
 ) -> None:
-    """Refuse what is no positive number; it may be ``infinite``.
-
-    Raises:
-        ValueError: It names the argument, what it is, and ``what`` it must be.
-    """
+    """Raise ValueError unless an argument is a positive number, finite unless ``infinite``."""
     if not (is_number(value) and value > 0 and (infinite or value < np.inf)):
-        raise ValueError(f"{name} is {value!r}; it must be {what}")
+        raise ValueError(f"{name} is {value!r}; it must be {expected}")
 
 
 def check_instance(name: str, value: Any, kind: type, advice: str = "") -> None:
-    """Refuse what is of another class.
-
-    Raises:
-        ValueError: It names the argument, what it is, and what it must be; the advice ends it.
-    """
+    """Raise ValueError, with the advice at its end, unless an argument is an instance of kind."""
     if isinstance(value, kind):
         return
     advice = f"; {advice}" if advice else ""
     if isinstance(value, type) and issubclass(value, kind):
-        made = value.__name__
-        raise ValueError(f"{name} is the class {made}; give an instance, {made}(...){advice}")
+        class_name = value.__name__
+        raise ValueError(
+            f"{name} is the class {class_name}; give an instance, {class_name}(...){advice}"
+        )
     article = "an" if kind.__name__[0] in "AEIOU" else "a"
     raise ValueError(
         f"{name} is a {type(value).__name__}; it must be {article} {kind.__name__}{advice}"
@@ -87,18 +73,14 @@ def check_instance(name: str, value: Any, kind: type, advice: str = "") -> None:
 
 
 def listed(name: str, values: Iterable[Any], kind: type) -> list[Any]:
-    """The values as a list, all of them of the class.
-
-    Raises:
-        ValueError: They are not; it says what was given.
-    """
+    """Return the values as a list; raise ValueError unless all are instances of ``kind``."""
     if isinstance(values, kind):
         raise ValueError(f"{name} is a single {kind.__name__}; give a list, {name}=[...]")
     if not isinstance(values, Iterable):
         raise ValueError(
             f"{name} is {values!r}; it must be a list of {kind.__name__} objects, {name}=[...]"
         )
-    found = list(values)
-    for i, value in enumerate(found):
-        check_instance(f"{name}[{i}]", value, kind)
-    return found
+    items = list(values)
+    for i, item in enumerate(items):
+        check_instance(f"{name}[{i}]", item, kind)
+    return items

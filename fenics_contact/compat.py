@@ -1,4 +1,4 @@
-"""The one place that knows that releases differ, by feature: DOLFINx 0.9 to 0.11, PETSc with it."""
+"""Differences between DOLFINx 0.9 to 0.11 and the PETSc releases used with them."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ if tuple(map(int, dolfinx.__version__.split(".")[:2])) < (0, 9):
         "later one, or use the container (docker/run)"
     )
 
-# The longest step of a line search, renamed in PETSc 3.24, like the line search SECANT; both are
-# bound to Python since 3.23.
-_line_searches = getattr(getattr(PETSc, "SNESLineSearch", None), "Type", None)
-_RENAMED = hasattr(_line_searches, "SECANT")
-LONGEST_STEP = "snes_linesearch_maxlambda" if _RENAMED else "snes_linesearch_maxstep"
-# The reason of SNES where the residual is not finite, renamed in 3.25 (the number is the same).
+# Option of the maximum step length of a line search. PETSc 3.24 renamed it, and the line search
+# SECANT, by which the release is recognised.
+_line_search_types = getattr(getattr(PETSc, "SNESLineSearch", None), "Type", None)
+_HAS_MAX_LAMBDA = hasattr(_line_search_types, "SECANT")
+LONGEST_STEP = "snes_linesearch_maxlambda" if _HAS_MAX_LAMBDA else "snes_linesearch_maxstep"
+# SNES converged reason for a residual that is not finite, renamed in PETSc 3.25 (same number).
 _reasons = PETSc.SNES.ConvergedReason
 NOT_FINITE = int(
     _reasons.DIVERGED_FUNCTION_NANORINF
@@ -54,15 +54,15 @@ NOT_FINITE = int(
 def create_facet_submesh(
     mesh: dolfinx.mesh.Mesh, facets: npt.NDArray[np.int32]
 ) -> tuple[dolfinx.mesh.Mesh, Any, npt.NDArray[np.int32]]:
-    """Make a mesh of some facets of ``mesh``. Collective.
+    """Create a submesh of facets of ``mesh``. Collective.
 
     Args:
         mesh: The parent mesh.
         facets: Facets of this rank (local indices), shape (n_facets,).
 
     Returns:
-        The submesh; what ``dolfinx.fem.form`` takes as ``entity_maps`` for it; and the parent
-        facet of each local cell of the submesh, shape (n_cells,).
+        The submesh; its ``entity_maps`` for ``dolfinx.fem.form``; and the parent facet of each
+        local cell of the submesh, shape (n_cells,).
     """
     fdim = mesh.topology.dim - 1
     submesh, facet_map, *_ = dolfinx.mesh.create_submesh(mesh, fdim, facets)
@@ -79,14 +79,14 @@ def create_facet_submesh(
 
 
 def entities_of(tags: dolfinx.mesh.MeshTags, mesh: dolfinx.mesh.Mesh) -> bool:
-    """Whether tags are of the entities of this mesh: numbers of another one mean others here."""
-    # Some releases wrap what is compared, and make the wrapper anew each time.
-    mine, theirs = tags.topology, mesh.topology
-    return getattr(mine, "_cpp_object", mine) is getattr(theirs, "_cpp_object", theirs)
+    """Return whether mesh tags belong to this mesh."""
+    # Some releases create a new Python wrapper of the topology at each access.
+    of_tags, of_mesh = tags.topology, mesh.topology
+    return getattr(of_tags, "_cpp_object", of_tags) is getattr(of_mesh, "_cpp_object", of_mesh)
 
 
 def option_was_read(name: str) -> bool:
-    """Whether anything has asked PETSc's database for an option, given without dash."""
+    """Return whether an option (without dash) has been queried from PETSc's options database."""
     options = PETSc.Options()
     if hasattr(options, "used"):  # petsc4py >= 3.23
         return bool(options.used(name))
@@ -99,12 +99,12 @@ def option_was_read(name: str) -> bool:
 def sparse_matrix(
     comm: MPI.Comm, n_columns: int, pointers: Any, columns: Any, values: Array
 ) -> PETSc.Mat:
-    """A matrix of this rank's rows, with the integers of this PETSc. Collective.
+    """Create a sparse matrix from this rank's rows in CSR format. Collective.
 
     Args:
-        comm: The ranks.
-        n_columns: Number of the columns that this rank owns.
-        pointers: Where the entries of each row begin and end, (n_rows + 1,).
+        comm: Communicator of the matrix.
+        n_columns: Number of columns owned by this rank.
+        pointers: CSR row pointers, (n_rows + 1,).
         columns: Global columns of the entries, (n_entries,).
         values: The entries, (n_entries,).
     """
@@ -113,7 +113,7 @@ def sparse_matrix(
 
 
 def cell_partitioner(ghost_mode: dolfinx.mesh.GhostMode) -> Any:
-    """What ``dolfinx.mesh.create_mesh`` distributes cells by: a facet has up to two of them."""
+    """Return a partitioner for ``dolfinx.mesh.create_mesh``, with up to two cells per facet."""
     try:
         return dolfinx.mesh.create_cell_partitioner(ghost_mode, 2)
     except TypeError:  # DOLFINx < 0.11
@@ -121,16 +121,13 @@ def cell_partitioner(ghost_mode: dolfinx.mesh.GhostMode) -> Any:
 
 
 def collapsed(space: fem.FunctionSpace) -> tuple[fem.FunctionSpace, npt.NDArray[np.int32]]:
-    """A subspace as a space of its own, and the dof of the whole for each of its dofs. Collective.
-
-    The dofs come as a list of numbers, since 0.11 as a list of one array.
-    """
-    own, dofs = space.collapse()
-    return own, np.asarray(dofs, dtype=np.int32).ravel()
+    """Collapse a subspace: return the space and the parent dof of each of its dofs. Collective."""
+    collapsed_space, dofs = space.collapse()
+    return collapsed_space, np.asarray(dofs, dtype=np.int32).ravel()  # nested since 0.11
 
 
 def geometry_element(mesh: dolfinx.mesh.Mesh) -> Any:
-    """The scalar Basix element of the geometry, over the nodes of `geometry_dofmap`."""
+    """Return the scalar Basix element of the mesh geometry, on the nodes of `geometry_dofmap`."""
     geometry = mesh.geometry
     cmap = geometry.cmaps[0] if hasattr(geometry, "cmaps") else geometry.cmap
     kind, variant = basix.CellType[mesh.topology.cell_name()], basix.LagrangeVariant(cmap.variant)
@@ -138,30 +135,30 @@ def geometry_element(mesh: dolfinx.mesh.Mesh) -> Any:
 
 
 def geometry_dofmap(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int32]:
-    """Geometry nodes of every local cell, shape (n_cells, n_nodes)."""
+    """Return the geometry nodes of every local cell, shape (n_cells, n_nodes)."""
     geometry = mesh.geometry
     return geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
 
 
 def contains(space: fem.FunctionSpace, other: Any) -> bool:
-    """Whether the space of a Dirichlet condition, bare in some releases, is in another one."""
-    whole, part = (getattr(each, "_cpp_object", each) for each in (space, other))
-    return bool(whole.contains(part))
+    """Return whether the space of a Dirichlet condition is a subspace of ``space``."""
+    parent, subspace = (getattr(each, "_cpp_object", each) for each in (space, other))
+    return bool(parent.contains(subspace))
 
 
 def interpolation_points(element: Any) -> Array:
-    """Interpolation points of a DOLFINx element: a method in 0.9, a property since."""
-    points = element.interpolation_points
+    """Return the interpolation points of a DOLFINx element."""
+    points = element.interpolation_points  # a method in 0.9, a property since
     return points() if callable(points) else points
 
 
 def gmsh_data(model: Any, comm: Any, rank: int, gdim: int) -> tuple[dolfinx.mesh.Mesh, Any, Any]:
-    """Mesh of the gmsh model of ``rank``, tags of its cells and facets (or None). Collective."""
+    """Return the mesh of the gmsh model of ``rank``, and cell and facet tags. Collective."""
     try:
         from dolfinx.io import gmsh as gmshio  # DOLFINx >= 0.10
     except ImportError:
         from dolfinx.io import gmshio
     data = gmshio.model_to_mesh(model, comm, rank, gdim=gdim)
-    if isinstance(data, tuple):  # a named one from 0.10 on, which has more behind these
+    if isinstance(data, tuple):  # a named tuple since 0.10, with more items
         return data[0], data[1], data[2]
     return data.mesh, data.cell_tags, data.facet_tags

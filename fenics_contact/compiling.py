@@ -1,4 +1,4 @@
-"""Compiled forms and expressions, and a word to who waits for them."""
+"""Compilation of forms and expressions, with a message if it takes long."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ __all__ = [
 ]
 
 logger = logging.getLogger("fenics_contact")
-# Seconds: what takes less was in the cache; when a user wonders.
-_FROM_CACHE, _LONG = 0.1, 3.0
+# Below the first time (seconds) a form came from the cache; from the second on a message is shown.
+_CACHE_HIT_SECONDS, _MESSAGE_SECONDS = 0.1, 3.0
 
 
 def compile_form(form: ufl.Form, entity_maps: Any = None) -> fem.Form:
-    """Compile a UFL form with the entity maps of its submeshes. Collective.
+    """Compile a UFL form with the entity maps of its submeshes, or load it from the cache.
 
-    What has been compiled before, in any run, is in DOLFINx's cache. If all that is not takes more
-    than some seconds, it is said once what the program is doing: at level INFO, or to a terminal.
+    Collective. If compilation takes more than some seconds in total, a message is shown once, in
+    the log at level INFO or else on a terminal.
     """
     start = time.perf_counter()
     compiled = fem.form(form, entity_maps=entity_maps or None)
@@ -42,10 +42,10 @@ def compile_form(form: ufl.Form, entity_maps: Any = None) -> fem.Form:
 
 
 def compile_by_rule(form: ufl.Form) -> list[fem.Form]:
-    """Compile a UFL form in parts that add up to it, of one kind of integral and one rule each.
+    """Compile a UFL form as a sum of forms with one integral type and quadrature rule each.
 
-    Collective. Of two integrals over a tag with different quadrature rules DOLFINx 0.9 assembles
-    one, without a word, where one of them is over other tags, too (DOLFINx issue 3735).
+    Collective. DOLFINx 0.9 silently drops one of two integrals with different quadrature rules over
+    a tag if one of them is over other tags, too (DOLFINx issue 3735).
     """
     parts: dict[tuple[str, str], list[ufl.Integral]] = {}
     for integral in form.integrals():
@@ -57,17 +57,14 @@ def compile_by_rule(form: ufl.Form) -> list[fem.Form]:
 def compile_expression(expression: Any, points: npt.NDArray[np.float64]) -> fem.Expression:
     """Compile a UFL expression at points of the reference cell, shape (n_points, tdim). Collective.
 
-    FFCx names it by its points as they are printed: with few digits another one's name.
+    FFCx derives its name from the printed points, which must not be rounded.
     """
     with printed_as_ever():
         return fem.Expression(expression, points)
 
 
 def printed_as_ever() -> AbstractContextManager[Any]:
-    """NumPy's own way of printing, in which Basix names quadrature elements, and FFCx expressions.
-
-    To a name given under other ``np.set_printoptions`` the same element is another one.
-    """
+    """Restore NumPy's default print options, on which names in Basix and FFCx depend."""
     return np.printoptions(
         precision=8,
         threshold=1000,
@@ -84,18 +81,18 @@ def printed_as_ever() -> AbstractContextManager[Any]:
 
 
 class CompileTimer:
-    """Time that went into compilation in this process."""
+    """Total compilation time of this process."""
 
     def __init__(self) -> None:
-        self._seconds, self._said = 0.0, False
+        self._seconds, self._message_shown = 0.0, False
 
     def add(self, seconds: float) -> None:
-        """Count it, and say so if it was not from the cache and has become long."""
-        if seconds > _FROM_CACHE:
+        """Add the time of a compilation; show a message if the total exceeds the limit."""
+        if seconds > _CACHE_HIT_SECONDS:
             self._seconds += seconds
-        if self._said or self._seconds < _LONG or MPI.COMM_WORLD.rank:
+        if self._message_shown or self._seconds < _MESSAGE_SECONDS or MPI.COMM_WORLD.rank:
             return
-        self._said = True
+        self._message_shown = True
         text = (
             "compiling forms; later runs find them in the cache, "
             f"{dolfinx.jit.get_options()['cache_dir']}"
@@ -103,7 +100,7 @@ class CompileTimer:
         if logger.isEnabledFor(logging.INFO):
             logger.info(text)
         elif sys.stderr.isatty():
-            print(f"\r\x1b[K{text}", file=sys.stderr)  # in place of a bar's line
+            print(f"\r\x1b[K{text}", file=sys.stderr)  # overwrites a progress bar
 
 
 waiting = CompileTimer()

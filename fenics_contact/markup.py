@@ -1,4 +1,4 @@
-"""Tables in HTML, as notebooks show objects."""
+"""HTML tables, for reports and the display of objects in notebooks."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ def html_table(
     rows: Iterable[Sequence[str]],
     remarks: Iterable[str] = (),
 ) -> str:
-    """A table with a title, the first cell of each row its name, and lines below it.
+    """Return an HTML table with a caption, row headers in the first column and remarks below it.
 
-    All is text: what would be markup is escaped.
+    All texts are escaped.
     """
     lines = [f"<table><caption>{escape(title)}</caption><thead><tr>"]
     lines += [f"<th>{escape(name)}</th>" for name in header]
