@@ -70,19 +70,19 @@ class LinearElastic:
         epsilon = ufl.sym(ufl.grad(w))
         if self.kind == "3D":
             return epsilon
-        across: Any = ufl.as_ufl(0.0)
+        out_of_plane: Any = ufl.as_ufl(0.0)
         if self.kind == "plane stress":
-            across = -self.nu / (1 - self.nu) * ufl.tr(epsilon)
+            out_of_plane = -self.nu / (1 - self.nu) * ufl.tr(epsilon)
         elif self.kind == "axisymmetric":
-            across = w[0] / ufl.SpatialCoordinate(_mesh(self.u))[0]
-        return _in_space(epsilon, across)
+            out_of_plane = w[0] / ufl.SpatialCoordinate(_mesh(self.u))[0]
+        return _embed(epsilon, out_of_plane)
 
     def stress_of(self, w: Any) -> Any:
         """Return the stress σ(w) of a displacement w, shape (3, 3) (UFL)."""
         epsilon, shear = self.strain(w), self.E / (2 * (1 + self.nu))
         in_plane = epsilon[0, 0] + epsilon[1, 1]
         if self.kind == "plane stress":
-            # Without the factor 1 - 2ν, which drops out: ν = 1/2 is an ordinary value here.
+            # The factor 1 - 2ν cancels: ν = 1/2 is admissible.
             mean = 2 * shear * self.nu / (1 - self.nu) * in_plane
             plane = ufl.as_tensor([[1, 0, 0], [0, 1, 0], [0, 0, 0]])
             return 2 * shear * ufl.dot(plane, epsilon) + mean * plane
@@ -185,22 +185,22 @@ class NeoHookean:
             self.energy += modulus / 4 * volume
             self.nominal = ufl.diff(self.energy, self.F)
         else:
-            # 1/λ or 1/K, which ν = 1/2 has, too.
-            soft = (1 - 2 * self.nu) / (2 * shear)
-            soft *= 3 / (1 + self.nu) if isochoric else 1 / self.nu
-            self._excess = self.J - (ufl.sqrt(1 + (soft * pressure) ** 2) - soft * pressure)
+            # κ = 1/λ or 1/K is finite at ν = 1/2.
+            kappa = (1 - 2 * self.nu) / (2 * shear)
+            kappa *= 3 / (1 + self.nu) if isochoric else 1 / self.nu
+            self._excess = self.J - (ufl.sqrt(1 + (kappa * pressure) ** 2) - kappa * pressure)
             self.nominal = ufl.diff(self.energy, self.F) - pressure * ufl.diff(self.J, self.F)
         self.stress = ufl.dot(self.nominal, ufl.transpose(self.F)) / self.J
 
     def gradient(self, w: Any) -> Any:
         """Return the material gradient of a displacement w, shape (3, 3) (UFL)."""
-        slope = ufl.grad(w)
+        grad_w = ufl.grad(w)
         if self.kind == "3D":
-            return slope
-        across: Any = ufl.as_ufl(0.0)
+            return grad_w
+        out_of_plane: Any = ufl.as_ufl(0.0)
         if self.kind == "axisymmetric":
-            across = w[0] / ufl.SpatialCoordinate(_mesh(self.u))[0]
-        return _in_space(slope, across)
+            out_of_plane = w[0] / ufl.SpatialCoordinate(_mesh(self.u))[0]
+        return _embed(grad_w, out_of_plane)
 
     def residual(self, v: Any, dx: ufl.Measure = ufl.dx, *, q: Any = None) -> ufl.Form:
         """Return the virtual work of the stresses, ∫ P:grad v weight dx.
@@ -229,7 +229,7 @@ class NeoHookean:
 
 
 def _check_kind(u: fem.Function, kind: str, kinds: list[str]) -> None:
-    """Refuse a kind that is none, or for another dimension."""
+    """Raise ValueError for an unknown kind, or one of another dimension."""
     if kind not in kinds:
         raise ValueError(f"kind is {kind!r}; use one of {kinds}")
     gdim = _mesh(u).geometry.dim
@@ -240,15 +240,15 @@ def _check_kind(u: fem.Function, kind: str, kinds: list[str]) -> None:
         )
 
 
-def _in_space(plane: Any, across: Any) -> Any:
-    """The tensor (3, 3) of one in the plane, with a component across it."""
+def _embed(plane: Any, out_of_plane: Any) -> Any:
+    """Extend a tensor (2, 2) to (3, 3), with its out-of-plane normal component."""
     return ufl.as_tensor(
-        [[plane[0, 0], plane[0, 1], 0], [plane[1, 0], plane[1, 1], 0], [0, 0, across]]
+        [[plane[0, 0], plane[0, 1], 0], [plane[1, 0], plane[1, 1], 0], [0, 0, out_of_plane]]
     )
 
 
 def _mesh(u: Any) -> Any:
-    """Of a function, or of what `ufl.split` gives of one, or sums of that."""
+    """Return the mesh of a function, or of an expression of functions, as from `ufl.split`."""
     functions = ufl.algorithms.extract_coefficients(u) if isinstance(u, ufl.core.expr.Expr) else []
     meshes = [f.function_space.mesh for f in functions if isinstance(f, fem.Function)]
     if not meshes:
@@ -261,11 +261,11 @@ def _mesh(u: Any) -> Any:
 def _coefficient(
     mesh: Any, name: str, value: Any, low: float, high: float, *, closed: bool = False
 ) -> Any:
-    """Numbers become constants of the mesh, so that their value is not compiled in."""
+    """Return a number as a fem.Constant, so that its value is not compiled in; or an expression."""
     if isinstance(value, ufl.core.expr.Expr):
         return value
     if not (is_number(value) and (low < value < high or (closed and value == high))):
-        included = ", which it may be" if closed else ""
+        included = " (included)" if closed else ""
         raise ValueError(
             f"{name} is {value!r}; it must be a number between {low:g} and {high:g}{included}"
         )

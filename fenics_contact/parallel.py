@@ -1,4 +1,4 @@
-"""Errors that every rank raises, and small reductions over the ranks."""
+"""Collective errors and warnings, and small reductions and gathers over the ranks."""
 
 from __future__ import annotations
 
@@ -33,24 +33,23 @@ __all__ = [
 
 logger = logging.getLogger("fenics_contact")
 
-# How long ranks that fail together may be apart (seconds), and the tag of their messages.
+# Seconds that a failing rank waits for the others to fail, too, and the tag of their messages.
 PATIENCE = 30.0
 _TAG = 7351
 
 
 def raise_collectively(comm: MPI.Comm, error: BaseException) -> None:
-    """Come back where all ranks have failed; end all of them where this one is alone.
+    """Return if all ranks have failed; abort all ranks if they have not after `PATIENCE` seconds.
 
-    A rank that fails where others do not is waited for by them in some collective call, for ever:
-    no rank can go on, nor take back what was begun. The failures are told to one another by
-    messages, which are not taken for a part of that call.
+    If a rank fails alone, the others wait for it in a collective call for ever (deadlock). Failing
+    ranks notify each other by point-to-point messages, which do not match that call.
     """
     others = [rank for rank in range(comm.size) if rank != comm.rank]
     requests = [comm.Isend(b"", rank, _TAG) for rank in others]
     requests += [comm.Irecv(bytearray(1), rank, _TAG) for rank in others]
-    end = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + PATIENCE
     while not MPI.Request.Testall(requests):
-        if time.monotonic() > end:
+        if time.monotonic() > deadline:
             logger.critical(
                 "rank %d failed while the others were waiting for it: aborting all ranks",
                 comm.rank,
@@ -62,14 +61,14 @@ def raise_collectively(comm: MPI.Comm, error: BaseException) -> None:
 
 @contextmanager
 def collective_errors(comm: MPI.Comm) -> Iterator[None]:
-    """Raise on every rank what one rank raised inside the block. Collective at its end.
+    """Raise an error of one rank inside the block on every rank. Collective at its end.
 
     The block must not communicate: a rank that raises leaves it early, and the others would wait.
 
     Raises:
-        BaseException: The error of this rank, or else the same type and text as on the first rank
-            that raised (those of OSError become that, and types that cannot be rebuilt from their
-            text RuntimeError).
+        BaseException: The error of this rank, or else one with the text of the first rank that
+            raised: of the same type for ValueError, TypeError and MemoryError, OSError for its
+            subclasses, RuntimeError for all other types.
     """
     if comm.size == 1:
         yield
@@ -94,11 +93,10 @@ def collective_errors(comm: MPI.Comm) -> Iterator[None]:
 
 
 def warn(comm: MPI.Comm, text: str, *, category: type[Warning] = UserWarning) -> None:
-    """Warn: in the log of the first rank, and by a Python warning on every rank.
+    """Warn in the log of the first rank and by a Python warning on every rank, with equal texts.
 
-    On all of them, because a warning may have been made an error. In the log, because FFCx leads
-    Python's warnings into one of its own, which nobody sees where logging has not been set up.
-    Nothing is communicated: the text is the same on every rank.
+    The Python warning is on every rank because a filter may turn it into an error. The log is
+    needed because FFCx redirects Python warnings to its own logger. There is no communication.
     """
     if comm.rank == 0:
         logger.warning(text)
@@ -106,53 +104,50 @@ def warn(comm: MPI.Comm, text: str, *, category: type[Warning] = UserWarning) ->
 
 
 def broadcast_from_root(comm: MPI.Comm, value: Any) -> Any:
-    """The first rank's value, on all ranks. Collective.
+    """Return the first rank's value on all ranks. Collective.
 
-    For what every rank computes of the same numbers and then decides by: factorisations of equal
-    matrices may differ in the last digits, between machines or by where in memory they are, and
-    with them the basis of a null space, or the side of a threshold.
+    Decisions based on a redundant computation need it: round-off may differ between ranks even for
+    equal input, and with it the basis of a null space or the side of a threshold.
     """
     return comm.bcast(value) if comm.size > 1 else value
 
 
 def global_sum(comm: MPI.Comm, values: npt.ArrayLike) -> Array:
-    """Sum of an array over the ranks, same shape. Collective."""
+    """Return the sum of an array over the ranks, same shape. Collective."""
     return np.asarray(comm.allreduce(np.asarray(values, dtype=np.float64), op=MPI.SUM))
 
 
 def global_max(comm: MPI.Comm, values: Array, empty: float = 0.0) -> float:
-    """Largest entry over the ranks; ``empty`` where no rank has one; NaN wins. Collective."""
+    """Return the largest entry over the ranks; ``empty`` without entries; NaN wins. Collective."""
     largest = float(values.max()) if values.size else -np.inf
-    if comm.size > 1:  # max() of MPI has no rule for NaN, so it goes through a gather
+    if comm.size > 1:  # MPI.MAX is undefined for NaN
         largest = float(np.max(comm.allgather(largest)))
     return empty if largest == -np.inf else largest
 
 
 def global_min(comm: MPI.Comm, values: Array, empty: float = 0.0) -> float:
-    """Smallest entry over the ranks; ``empty`` where no rank has one; NaN wins. Collective."""
+    """Return the smallest entry over the ranks; ``empty`` without entries; NaN wins. Collective."""
     return -global_max(comm, -np.asarray(values), -empty)
 
 
 def global_mean(comm: MPI.Comm, vectors: Array) -> Array:
-    """Mean of the rows of all ranks, (d,); zero if there are none. Collective."""
+    """Return the mean of the rows of all ranks, (d,); zero without rows. Collective."""
     sums = global_sum(comm, [*vectors.sum(axis=0), len(vectors)])
     return np.asarray(sums[:-1] / max(sums[-1], 1.0))
 
 
 def longest(comm: MPI.Comm, vectors: Array) -> float:
-    """Length of the longest row over the ranks, in any frame; 0 without rows; NaN wins. Collective.
+    """Return the largest Euclidean norm of rows (n, gdim), or magnitude of scalars (n,).
 
-    Args:
-        comm: The ranks.
-        vectors: (n, gdim); numbers, (n,), count by their size.
+    Collective. The result is 0 without rows; NaN wins.
     """
-    with np.errstate(over="ignore"):  # of a diverged state
+    with np.errstate(over="ignore"):  # diverged states
         lengths = np.abs(vectors) if vectors.ndim == 1 else np.linalg.norm(vectors, axis=1)
     return global_max(comm, lengths)
 
 
 def all_finite(comm: MPI.Comm, values: Array) -> bool:
-    """Whether all of the ranks' values are numbers, and finite. Collective."""
+    """Return whether the values of all ranks are finite. Collective."""
     return bool(comm.allreduce(bool(np.isfinite(values).all()), op=MPI.LAND))
 
 
@@ -162,6 +157,6 @@ def gather_rows(comm: MPI.Comm, rows: Array) -> Array:
 
 
 def gather_on_first(comm: MPI.Comm, *rows: npt.NDArray[Any]) -> list[npt.NDArray[Any]] | None:
-    """Stack rows of all ranks as `gather_rows`, on the first; None on the others. Collective."""
+    """Stack rows of all ranks, by rank, on the first one; return None on the others. Collective."""
     parts = comm.gather(rows)
     return None if parts is None else [np.concatenate(part) for part in zip(*parts, strict=True)]

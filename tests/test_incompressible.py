@@ -215,7 +215,7 @@ def test_what_has_no_sense_is_refused():
     with pytest.raises(ValueError, match=r"nu is 0\.5; .* between -1 and 0\.5"):
         NeoHookean(u, E, 0.5, "plane strain")
     for nu in (0.0, 0.6):
-        with pytest.raises(ValueError, match=rf"nu is {nu}; .* which it may be"):
+        with pytest.raises(ValueError, match=rf"nu is {nu}; .* \(included\)"):
             NeoHookean(u, E, nu, "plane strain", pressure=p)
     with pytest.raises(ValueError, match="pressure has shape"):
         NeoHookean(u, E, 0.5, "plane strain", pressure=u)
