@@ -1,4 +1,4 @@
-"""Joining of separate meshes of several bodies into one mesh."""
+"""Joining of meshes of several bodies into one mesh, with new cell and facet tags."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from fenics_contact.types import Array, Index
 __all__ = ["JoinedMesh", "exchange_rows", "join_meshes", "tag_facets"]
 
 Part: TypeAlias = dolfinx.mesh.Mesh | Sequence[Any]
-Numbers: TypeAlias = Mapping[Hashable, Mapping[int | None, int]]
+TagNumbers: TypeAlias = Mapping[Hashable, Mapping[int | None, int]]
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class JoinedMesh:
     cells: dolfinx.mesh.MeshTags
     facets: dolfinx.mesh.MeshTags
     bodies: tuple[Hashable, ...]
-    cell_numbers: Numbers
-    facet_numbers: Numbers
+    cell_numbers: TagNumbers
+    facet_numbers: TagNumbers
 
     def body(self, body: Hashable) -> tuple[int, ...]:
         """Return all cell tags of a body, for a ``ufl.Measure``.
@@ -54,7 +54,7 @@ class JoinedMesh:
         Raises:
             ValueError: There is no such body.
         """
-        return tuple(self._of(self.cell_numbers, body).values())
+        return tuple(self._tags_of(self.cell_numbers, body).values())
 
     def cell(self, body: Hashable, tag: int) -> int:
         """Return the new tag of the cells that had ``tag`` in the mesh of a body.
@@ -62,7 +62,7 @@ class JoinedMesh:
         Raises:
             ValueError: There is no such body, or it has no such tag.
         """
-        return self._number("cell", self.cell_numbers, body, tag)
+        return self._tag_number("cell", self.cell_numbers, body, tag)
 
     def facet(self, body: Hashable, tag: int) -> int:
         """Return the new tag of the facets that had ``tag`` in the mesh of a body.
@@ -70,7 +70,7 @@ class JoinedMesh:
         Raises:
             ValueError: There is no such body, or it has no such tag.
         """
-        return self._number("facet", self.facet_numbers, body, tag)
+        return self._tag_number("facet", self.facet_numbers, body, tag)
 
     def by_body(self, values: Mapping[Hashable, float]) -> fem.Function:
         """Return a piecewise constant function with one value per body, such as a modulus.
@@ -99,13 +99,13 @@ class JoinedMesh:
             field.x.array[of_cell[np.isin(self.cells.values, self.body(body))]] = values[body]
         return field
 
-    def _of(self, numbers: Numbers, body: Hashable) -> Mapping[int | None, int]:
+    def _tags_of(self, numbers: TagNumbers, body: Hashable) -> Mapping[int | None, int]:
         if body not in self.bodies:
             raise ValueError(f"there is no body {body!r}; the bodies are {list(self.bodies)!r}")
         return numbers[body]
 
-    def _number(self, what: str, numbers: Numbers, body: Hashable, tag: int) -> int:
-        known = self._of(numbers, body)
+    def _tag_number(self, what: str, numbers: TagNumbers, body: Hashable, tag: int) -> int:
+        known = self._tags_of(numbers, body)
         if not isinstance(tag, Hashable) or tag is None or tag not in known:
             tags = [old for old in known if old is not None]
             raise ValueError(f"no {what} of body {body!r} had the tag {tag!r}; its tags are {tags}")
@@ -142,21 +142,21 @@ def join_meshes(parts: Mapping[Hashable, Part] | Iterable[Part]) -> JoinedMesh:
         )
     if not given:
         raise ValueError("parts is empty; give at least one body")
-    bodies = [_body(name, part) for name, part in zip(names, given, strict=True)]
-    _check_alike(names, [mesh for mesh, _, _ in bodies])
+    bodies = [_check_part(name, part) for name, part in zip(names, given, strict=True)]
+    _check_compatible(names, [mesh for mesh, _, _ in bodies])
     first = bodies[0][0]
     comm, d = first.comm, first.topology.dim
 
     cells, x = _cells_and_nodes([mesh for mesh, _, _ in bodies])
-    cell_numbers, facet_numbers, data = _renumbered(names, bodies)
+    cell_numbers, facet_numbers, data = _renumber_tags(names, bodies)
     domain = ufl.Mesh(first.ufl_domain().ufl_coordinate_element())
     partitioner = compat.cell_partitioner(dolfinx.mesh.GhostMode.none)
     mesh = dolfinx.mesh.create_mesh(comm, cells=cells, x=x, e=domain, partitioner=partitioner)
 
-    # Cells keep the order of their nodes, and with it that of their facets.
+    # The local order of nodes, and therefore of facets, is unchanged.
     data = exchange_rows(comm, data, np.asarray(mesh.topology.original_cell_index))
-    every = np.arange(len(data), dtype=np.int32)
-    cell_tags = dolfinx.mesh.meshtags(mesh, d, every, data[:, 0].astype(np.int32))
+    all_cells = np.arange(len(data), dtype=np.int32)
+    cell_tags = dolfinx.mesh.meshtags(mesh, d, all_cells, data[:, 0].astype(np.int32))
     facet_tags = tag_facets(mesh, data[:, 1:])
     mesh.topology.create_connectivity(d - 1, d)  # for Dirichlet conditions on tagged facets
     return JoinedMesh(mesh, cell_tags, facet_tags, names, cell_numbers, facet_numbers)
@@ -167,12 +167,8 @@ Body: TypeAlias = tuple[
 ]
 
 
-def _body(name: Hashable, part: Any) -> Body:
-    """A part, whole.
-
-    Raises:
-        ValueError: It is something else.
-    """
+def _check_part(name: Hashable, part: Any) -> Body:
+    """Return mesh, cell tags and facet tags of a body, or raise ValueError if they are invalid."""
     values = [part] if isinstance(part, dolfinx.mesh.Mesh) else part
     if not (isinstance(values, Sequence) and 1 <= len(values) <= 3):
         kinds = type(part).__name__
@@ -202,19 +198,15 @@ def _body(name: Hashable, part: Any) -> Body:
     return mesh, cell_tags, facet_tags
 
 
-def _check_alike(names: Sequence[Hashable], meshes: Sequence[dolfinx.mesh.Mesh]) -> None:
-    """Refuse meshes that cannot be one.
-
-    Raises:
-        ValueError: It names the first body and the other one.
-    """
+def _check_compatible(names: Sequence[Hashable], meshes: Sequence[dolfinx.mesh.Mesh]) -> None:
+    """Raise ValueError unless the meshes have the same cells, dimension and communicator."""
 
     def kind(mesh: dolfinx.mesh.Mesh) -> str:
         element = compat.geometry_element(mesh)
-        told = f"cells of type {mesh.topology.cell_name()} and geometric degree {element.degree}"
-        # Below, the nodes of all variants are the same.
+        cells = f"cells of type {mesh.topology.cell_name()} and geometric degree {element.degree}"
+        # Up to degree 2 all variants have the same nodes.
         variant = f", nodes {element.lagrange_variant.name}" if element.degree > 2 else ""
-        return f"{told}{variant} in {mesh.geometry.dim} dimensions"
+        return f"{cells}{variant} in {mesh.geometry.dim} dimensions"
 
     for name, mesh in zip(names[1:], meshes[1:], strict=True):
         if kind(mesh) != kind(meshes[0]):
@@ -222,8 +214,8 @@ def _check_alike(names: Sequence[Hashable], meshes: Sequence[dolfinx.mesh.Mesh])
                 f"body {names[0]!r} has {kind(meshes[0])}, and body {name!r} has {kind(mesh)}: "
                 "all must be the same"
             )
-        same = MPI.Comm.Compare(mesh.comm, meshes[0].comm)
-        if same not in (MPI.IDENT, MPI.CONGRUENT):
+        comparison = MPI.Comm.Compare(mesh.comm, meshes[0].comm)
+        if comparison not in (MPI.IDENT, MPI.CONGRUENT):
             raise ValueError(
                 f"body {names[0]!r} is on {meshes[0].comm.size} ranks, and body {name!r} is on "
                 f"{mesh.comm.size}, or on others: create all meshes with the same communicator"
@@ -231,12 +223,15 @@ def _check_alike(names: Sequence[Hashable], meshes: Sequence[dolfinx.mesh.Mesh])
 
 
 def _cells_and_nodes(meshes: Sequence[dolfinx.mesh.Mesh]) -> tuple[Index, Array]:
-    """This rank's own cells by new global numbers of nodes, and its own nodes. Collective."""
+    """Return this rank's cells by global node numbers of the joined mesh, and its nodes.
+
+    Collective.
+    """
     comm, d = meshes[0].comm, meshes[0].geometry.dim
     maps = [mesh.geometry.index_map() for mesh in meshes]
     n_own = np.array([nodes.size_local for nodes in maps])
     counts = np.array(comm.allgather(n_own)).reshape(comm.size, len(meshes))
-    # Nodes stand rank by rank, and on every rank body by body.
+    # Nodes are numbered rank by rank, and on each rank body by body.
     new = np.cumsum(counts).reshape(counts.shape) - counts
     old = np.cumsum(counts, axis=0) - counts
     cells = []
@@ -252,12 +247,14 @@ def _cells_and_nodes(meshes: Sequence[dolfinx.mesh.Mesh]) -> tuple[Index, Array]
     return np.concatenate(cells).astype(np.int64), np.concatenate(x)
 
 
-def _renumbered(names: Sequence[Hashable], bodies: Sequence[Body]) -> tuple[Numbers, Numbers, Any]:
-    """New numbers of cell tags and of facet tags, and these of this rank's own cells. Collective.
+def _renumber_tags(
+    names: Sequence[Hashable], bodies: Sequence[Body]
+) -> tuple[TagNumbers, TagNumbers, Any]:
+    """Renumber cell and facet tags. Collective.
 
     Returns:
-        Both numberings, and of every cell its tag, followed by the tag of each of its facets or
-        zero, (n_cells, 1 + n_facets).
+        New cell tags, new facet tags, and for every owned cell its tag, followed by the tag of each
+        of its facets or zero, (n_cells, 1 + n_facets).
     """
     cell_numbers: dict[Hashable, dict[int | None, int]] = {}
     facet_numbers: dict[Hashable, dict[int | None, int]] = {}
@@ -266,8 +263,10 @@ def _renumbered(names: Sequence[Hashable], bodies: Sequence[Body]) -> tuple[Numb
         d = mesh.topology.dim
         cell_map = mesh.topology.index_map(d)
         n_cells, n_all = cell_map.size_local, cell_map.size_local + cell_map.num_ghosts
-        known, numbers = _numbered(mesh.comm, cell_tags, n_cell_tags)
-        of_cell = _dense(mesh.comm, f"cell_tags of body {name!r}", cell_tags, numbers, n_all)
+        known, numbers = _number_tags(mesh.comm, cell_tags, n_cell_tags)
+        of_cell = _tags_of_entities(
+            mesh.comm, f"cell_tags of body {name!r}", cell_tags, numbers, n_all
+        )
         if mesh.comm.allreduce(int(np.count_nonzero(of_cell[:n_cells] == 0))):
             numbers[None] = n_cell_tags + len(known) + 1
             of_cell[of_cell == 0] = numbers[None]
@@ -277,34 +276,34 @@ def _renumbered(names: Sequence[Hashable], bodies: Sequence[Body]) -> tuple[Numb
         mesh.topology.create_connectivity(d, d - 1)
         facet_map = mesh.topology.index_map(d - 1)
         n_all = facet_map.size_local + facet_map.num_ghosts
-        known, numbers = _numbered(mesh.comm, facet_tags, n_facet_tags)
+        known, numbers = _number_tags(mesh.comm, facet_tags, n_facet_tags)
         what = f"facet_tags of body {name!r}"
-        of_facet = _dense(mesh.comm, what, facet_tags, numbers, n_all)
+        of_facet = _tags_of_entities(mesh.comm, what, facet_tags, numbers, n_all)
         facet_numbers[name] = numbers
         n_facet_tags += len(numbers)
-        facets = _facets_of_cells(mesh)[:n_cells]
+        facets = _cell_facets(mesh)[:n_cells]
         rows.append(np.column_stack([of_cell[:n_cells], of_facet[facets]]))
     return cell_numbers, facet_numbers, np.concatenate(rows)
 
 
-def _numbered(
-    comm: MPI.Comm, tags: dolfinx.mesh.MeshTags | None, before: int
+def _number_tags(
+    comm: MPI.Comm, tags: dolfinx.mesh.MeshTags | None, offset: int
 ) -> tuple[list[int], dict[int | None, int]]:
-    """Tags of all ranks, ascending, and their new numbers after those before. Collective."""
-    mine = [] if tags is None else np.unique(tags.values).tolist()
-    known = sorted(set().union(*comm.allgather(mine)))
-    return known, {tag: before + 1 + i for i, tag in enumerate(known)}
+    """Return the sorted tags of all ranks, and their new numbers from offset + 1. Collective."""
+    local = [] if tags is None else np.unique(tags.values).tolist()
+    known = sorted(set().union(*comm.allgather(local)))
+    return known, {tag: offset + 1 + i for i, tag in enumerate(known)}
 
 
-def _dense(
+def _tags_of_entities(
     comm: MPI.Comm,
     what: str,
     tags: dolfinx.mesh.MeshTags | None,
     numbers: Mapping[int | None, int],
     n: int,
 ) -> npt.NDArray[np.int64]:
-    """The new tag of every entity of this rank, or 0, (n,). Collective."""
-    found = np.zeros(n, dtype=np.int64)
+    """Return the new tag of every entity of this rank, or 0, (n,). Collective."""
+    new_tags = np.zeros(n, dtype=np.int64)
     with collective_errors(comm):
         if tags is not None and len(tags.indices):
             if tags.indices.max() >= n:
@@ -312,13 +311,13 @@ def _dense(
                     f"{what} are on number {tags.indices.max()}, and the mesh has {n} there: give "
                     "the tags of this mesh"
                 )
-            old, place = np.unique(tags.values, return_inverse=True)
-            found[tags.indices] = np.array([numbers[tag] for tag in old.tolist()])[place]
-    return found
+            old, inverse = np.unique(tags.values, return_inverse=True)
+            new_tags[tags.indices] = np.array([numbers[tag] for tag in old.tolist()])[inverse]
+    return new_tags
 
 
-def _facets_of_cells(mesh: dolfinx.mesh.Mesh) -> Index:
-    """The facets of every cell of this rank in the order of the reference cell."""
+def _cell_facets(mesh: dolfinx.mesh.Mesh) -> Index:
+    """Return the facets of every cell of this rank, in the order of the reference cell."""
     d = mesh.topology.dim
     mesh.topology.create_connectivity(d, d - 1)
     of_cell = mesh.topology.connectivity(d, d - 1)
@@ -326,40 +325,31 @@ def _facets_of_cells(mesh: dolfinx.mesh.Mesh) -> Index:
     return of_cell.array.reshape(-1, n)
 
 
-def exchange_rows(comm: MPI.Comm, rows: Any, wanted: Index) -> Any:
-    """Rows by their numbers over all ranks, from the ranks that have them. Collective.
-
-    Args:
-        comm: The ranks.
-        rows: This rank's, (n, m).
-        wanted: Numbers, (k,).
-
-    Returns:
-        The rows, (k, m).
-    """
+def exchange_rows(comm: MPI.Comm, rows: Any, row_numbers: Index) -> Any:
+    """Return rows (k, m) of a distributed array (n, m) by their global numbers (k,). Collective."""
     ends = np.cumsum(comm.allgather(len(rows)))
     first = int(ends[comm.rank]) - len(rows)
-    owner = np.searchsorted(ends, wanted, side="right")
-    asked = comm.alltoall([wanted[owner == rank] for rank in range(comm.size)])
-    answers = comm.alltoall([rows[numbers - first] for numbers in asked])
-    found = np.empty((len(wanted), rows.shape[1]), dtype=rows.dtype)
-    for rank, answer in enumerate(answers):
-        found[owner == rank] = answer
-    return found
+    owner = np.searchsorted(ends, row_numbers, side="right")
+    requests = comm.alltoall([row_numbers[owner == rank] for rank in range(comm.size)])
+    replies = comm.alltoall([rows[numbers - first] for numbers in requests])
+    received = np.empty((len(row_numbers), rows.shape[1]), dtype=rows.dtype)
+    for rank, reply in enumerate(replies):
+        received[owner == rank] = reply
+    return received
 
 
 def tag_facets(mesh: dolfinx.mesh.Mesh, tags: Any) -> dolfinx.mesh.MeshTags:
-    """Tags of facets, the same on all ranks that share them. Collective.
+    """Create facet tags that agree on all ranks that share a facet. Collective.
 
     Args:
         mesh: The mesh.
-        tags: Of the facets of each cell of this rank, 0 where there is none, (n_cells, n).
+        tags: Tags of the facets of each cell of this rank, 0 for no tag, (n_cells, n_facets).
     """
     d = mesh.topology.dim
-    facets = _facets_of_cells(mesh)
+    facets = _cell_facets(mesh)
     values = la.vector(mesh.topology.index_map(d - 1), 2)
     tag = values.array.reshape(-1, 2)
-    # The tag of an inner facet may be known to one of its cells alone.
+    # Only one of the two cells of an interior facet may have its tag.
     np.maximum.at(tag[:, 0], facets, tags)
     tag[:, 1] = tag[:, 0] > 0
     values.scatter_reverse(la.InsertMode.add)

@@ -1,4 +1,4 @@
-"""Conversion of gmsh models to DOLFINx meshes."""
+"""Conversion of gmsh models and of arrays to DOLFINx meshes with tags."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fenics_contact.types import Array, Index
 
 __all__ = ["mesh_from_arrays", "model_to_mesh"]
 
-# Geometric degree by number of nodes, for every cell type that contact obstacles.
+# Geometric degree by number of nodes, for every supported cell type.
 _DEGREES = {
     "triangle": {3: 1, 6: 2},
     "quadrilateral": {4: 1, 9: 2},
@@ -30,8 +30,7 @@ _DEGREES = {
 }
 _NODE_ORDERS = ("vtk", "gmsh", "dolfinx")
 _LARGEST_TAG = np.iinfo(np.int32).max
-# Number of rows of a bad array that an error message shows.
-_SHOWN_ROWS = 3
+_MAX_ROWS_IN_ERROR = 3
 
 
 def model_to_mesh(
@@ -60,16 +59,16 @@ def model_to_mesh(
     """
     with collective_errors(comm):
         if comm.rank == rank:
-            _check(model, gdim)
+            _check_gmsh_model(model, gdim)
     mesh, cell_tags, facet_tags = compat.gmsh_data(model, comm, rank, gdim)
     if facet_tags is None:
-        nothing = np.empty(0, dtype=np.int32)
-        facet_tags = dolfinx.mesh.meshtags(mesh, gdim - 1, nothing, nothing)
+        empty = np.empty(0, dtype=np.int32)
+        facet_tags = dolfinx.mesh.meshtags(mesh, gdim - 1, empty, empty)
     return mesh, cell_tags, facet_tags
 
 
-def _check(model: Any, gdim: int) -> None:
-    """Check for models that DOLFINx would convert incompletely, or fail at on one rank only."""
+def _check_gmsh_model(model: Any, gdim: int) -> None:
+    """Refuse models that DOLFINx would convert incompletely, or that fail on one rank only."""
     dimensions = sorted({dim for dim, _ in model.getPhysicalGroups()})
     if not dimensions or dimensions[-1] != gdim:
         raise ValueError(
@@ -86,13 +85,13 @@ def _check(model: Any, gdim: int) -> None:
         for entity in groups:
             kinds, numbers, _ = model.mesh.getElements(dim, entity)
             types.update(kinds)
-            n_grouped += sum(len(some) for some in numbers)
-        n_all = sum(len(some) for some in model.mesh.getElements(dim)[1])
+            n_grouped += sum(len(of_type) for of_type in numbers)
+        n_all = sum(len(of_type) for of_type in model.mesh.getElements(dim)[1])
         if dim == gdim and n_all == 0:
             raise ValueError(
                 f"the gmsh model has no cells: call gmsh.model.mesh.generate({gdim}) first"
             )
-        shared = next((some for some in groups.values() if len(some) > 1), None)
+        shared = next((tags for tags in groups.values() if len(tags) > 1), None)
         if shared:
             names = [f"{group} {model.getPhysicalName(dim, group)!r}" for group in shared]
             raise ValueError(
@@ -206,8 +205,8 @@ def mesh_from_arrays(
         partitioner=compat.cell_partitioner(dolfinx.mesh.GhostMode.none),
     )
     rows = exchange_rows(comm, rows, np.asarray(mesh.topology.original_cell_index))
-    every = np.arange(len(rows), dtype=np.int32)
-    tags_of_cells = dolfinx.mesh.meshtags(mesh, gdim, every, rows[:, 0].astype(np.int32))
+    all_cells = np.arange(len(rows), dtype=np.int32)
+    tags_of_cells = dolfinx.mesh.meshtags(mesh, gdim, all_cells, rows[:, 0].astype(np.int32))
     numbered = tag_facets(mesh, rows[:, 1:])
     values = np.array(facet_ids, dtype=np.int32)[numbered.values - 1]
     tags_of_facets = dolfinx.mesh.meshtags(mesh, gdim - 1, numbered.indices, values)
@@ -230,7 +229,7 @@ def _integers(what: str, values: Any, n_columns: str) -> Index:
 
 
 def _check_range(what: str, indices: Index, n_points: int) -> None:
-    """Refuse indices of points that do not exist."""
+    """Raise ValueError for indices of points that do not exist."""
     if indices.size == 0 or (indices.min() >= 0 and indices.max() < n_points):
         return
     hint = "; indices count from 0: subtract 1" if indices.max() == n_points else ""
@@ -276,11 +275,11 @@ def _cells(cells: Any, n_points: int, kind: str) -> Index:
         )
     _check_range("cells", nodes, n_points)
     ordered = np.sort(nodes, axis=1)
-    twice = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
-    if len(twice):
+    collapsed = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
+    if len(collapsed):
         raise ValueError(
-            f"{len(twice)} cells have a point twice, the first is cells[{twice[0]}] = "
-            f"{nodes[twice[0]].tolist()}; remove collapsed cells, or mesh without them"
+            f"{len(collapsed)} cells have a point twice, the first is cells[{collapsed[0]}] = "
+            f"{nodes[collapsed[0]].tolist()}; remove collapsed cells, or mesh without them"
         )
     return nodes
 
@@ -296,10 +295,10 @@ def _to_dolfinx(kind: str, n_nodes: int, order: str) -> Index:
 
 
 def _check_jacobians(x: Array, nodes: Index, kind: str, node_order: str) -> None:
-    """Refuse cells without volume, and those whose nodes are in another order.
+    """Raise ValueError for cells without volume or with nodes in another order.
 
-    The Jacobian determinant has one sign at the vertices. Edge nodes of second-order cells are
-    closer to the middle of their edge than its ends are.
+    In a valid cell the Jacobian determinant has the same sign at all vertices, and edge nodes of
+    second-order cells are closer to the midpoint of their edge than its ends.
     """
     shape, gdim = basix.CellType[kind], x.shape[1]
     degree = _DEGREES[kind][nodes.shape[1]]
@@ -318,19 +317,19 @@ def _check_jacobians(x: Array, nodes: Index, kind: str, node_order: str) -> None
             f"{len(small)} cells have no volume, the first is cells[{small[0]}] with the points "
             f"{corners[small[0]].tolist()}; remove them, or mesh without them"
         )
-    tangled = det.min(axis=1) * det.max(axis=1) <= 0
+    invalid = det.min(axis=1) * det.max(axis=1) <= 0
     edges = np.array(basix.topology(shape)[1])
     for edge, dofs in zip(edges, element.entity_dofs[1], strict=True):
         ends = corners[:, edge]
-        for node in dofs:  # none in linear cells
+        for node in dofs:
             offset = corners[:, node] - ends.mean(axis=1)
-            half = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / 2
-            tangled |= np.linalg.norm(offset, axis=1) >= half
-    mixed = np.flatnonzero(tangled)
-    if len(mixed):
+            half_length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / 2
+            invalid |= np.linalg.norm(offset, axis=1) >= half_length
+    bad = np.flatnonzero(invalid)
+    if len(bad):
         raise ValueError(
-            f"{len(mixed)} of {len(nodes)} cells have a Jacobian determinant that changes sign, or "
-            f"an edge node far from the middle of its edge, the first is cells[{mixed[0]}]; if it "
+            f"{len(bad)} of {len(nodes)} cells have a Jacobian determinant that changes sign, or "
+            f"an edge node far from the middle of its edge, the first is cells[{bad[0]}]; if it "
             f"is all of them, their nodes are not in the order node_order={node_order!r}: give "
             f"another of {_NODE_ORDERS}; else the cells are too distorted"
         )
@@ -352,16 +351,13 @@ def _cell_tags(cell_tags: Any, n_cells: int) -> Index:
 
 
 def _fill_facet_rows(rows: Index, facets: Any, of_cells: Index, n_points: int) -> list[int]:
-    """Write 1 plus the position of its tag for each tagged facet, 0 for the others.
+    """Write 1 plus the position of its tag into ``rows`` for each tagged facet; return the tags.
 
     Args:
         rows: Zeros on entry, shape (n_cells, facets per cell).
         facets: The argument of `mesh_from_arrays`.
         of_cells: Vertices of the facets of all cells, shape (n_cells, facets per cell, n_vertices).
         n_points: Number of points.
-
-    Returns:
-        The tags.
     """
     if facets is None:
         return []
@@ -374,8 +370,8 @@ def _fill_facet_rows(rows: Index, facets: Any, of_cells: Index, n_points: int) -
     ids: list[int] = []
     given, numbers = [], []
     for tag, values in facets.items():
-        whole = isinstance(tag, Integral) and not isinstance(tag, bool)
-        if not (whole and abs(int(tag)) <= _LARGEST_TAG):
+        is_integer = isinstance(tag, Integral) and not isinstance(tag, bool)
+        if not (is_integer and abs(int(tag)) <= _LARGEST_TAG):
             raise ValueError(
                 f"facets has the tag {tag!r}; tags must be whole numbers, {_LARGEST_TAG} at most"
             )
@@ -394,24 +390,24 @@ def _fill_facet_rows(rows: Index, facets: Any, of_cells: Index, n_points: int) -
         numbers.append(np.full(len(indices), len(ids)))
     if not given:
         return ids
-    wanted, number = np.concatenate(given), np.concatenate(numbers)
-    # Only facets with all of their vertices on tagged ones are compared.
+    tagged, number = np.concatenate(given), np.concatenate(numbers)
+    # Only facets whose vertices all belong to tagged facets are candidates.
     on_tagged = np.zeros(n_points, dtype=np.bool_)
-    on_tagged[wanted] = True
+    on_tagged[tagged] = True
     cell, facet = np.nonzero(on_tagged[of_cells].all(axis=2))
     candidates = np.sort(of_cells[cell, facet], axis=1)
-    _, inverse = np.unique(np.concatenate([wanted, candidates]), axis=0, return_inverse=True)
+    _, inverse = np.unique(np.concatenate([tagged, candidates]), axis=0, return_inverse=True)
     inverse = inverse.ravel()
-    key, candidate_key = inverse[: len(wanted)], inverse[len(wanted) :]
-    _refuse_unknown(wanted, number, ~np.isin(key, candidate_key), ids)
+    key, candidate_key = inverse[: len(tagged)], inverse[len(tagged) :]
+    _check_known_facets(tagged, number, ~np.isin(key, candidate_key), ids)
     tag_of_key = np.zeros(inverse.max() + 1, dtype=np.int64)
     tag_of_key[key] = number
-    other = np.flatnonzero(tag_of_key[key] != number)
-    if len(other):
-        first = other[0]
+    ambiguous = np.flatnonzero(tag_of_key[key] != number)
+    if len(ambiguous):
+        first = ambiguous[0]
         pair = ids[number[first] - 1], ids[tag_of_key[key[first]] - 1]
         raise ValueError(
-            f"{len(other)} facets have two tags, such as {wanted[first].tolist()} with {pair[0]} "
+            f"{len(ambiguous)} facets have two tags, such as {tagged[first].tolist()} with {pair[0]} "
             f"and {pair[1]}; leave them in one, and name both where both are meant, as "
             f"ContactSurface(mesh, tags, {list(pair)}) and ds({pair}) do"
         )
@@ -419,14 +415,14 @@ def _fill_facet_rows(rows: Index, facets: Any, of_cells: Index, n_points: int) -
     return ids
 
 
-def _refuse_unknown(wanted: Index, number: Index, unknown: Any, ids: list[int]) -> None:
-    """Refuse tagged facets that no cell has."""
+def _check_known_facets(tagged: Index, number: Index, unknown: Any, ids: list[int]) -> None:
+    """Raise ValueError for tagged facets that belong to no cell."""
     if not unknown.any():
         return
     first = number[unknown][0]
-    shown = wanted[unknown & (number == first)]
+    bad = tagged[unknown & (number == first)]
     raise ValueError(
-        f"facets[{ids[first - 1]}] has {len(shown)} facets that belong to no cell, with the "
-        f"vertices {shown[:_SHOWN_ROWS].tolist()}; give facets of the cells by the same indices "
-        "of points, vertices first"
+        f"facets[{ids[first - 1]}] has {len(bad)} facets that belong to no cell, with the vertices "
+        f"{bad[:_MAX_ROWS_IN_ERROR].tolist()}; give facets of the cells by the same indices of "
+        "points, vertices first"
     )
