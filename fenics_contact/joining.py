@@ -264,9 +264,7 @@ def _renumber_tags(
         cell_map = mesh.topology.index_map(d)
         n_cells, n_all = cell_map.size_local, cell_map.size_local + cell_map.num_ghosts
         known, numbers = _number_tags(mesh.comm, cell_tags, n_cell_tags)
-        of_cell = _tags_of_entities(
-            mesh.comm, f"cell_tags of body {name!r}", cell_tags, numbers, n_all
-        )
+        of_cell = _expand_tags(mesh.comm, f"cell_tags of body {name!r}", cell_tags, numbers, n_all)
         if mesh.comm.allreduce(int(np.count_nonzero(of_cell[:n_cells] == 0))):
             numbers[None] = n_cell_tags + len(known) + 1
             of_cell[of_cell == 0] = numbers[None]
@@ -278,7 +276,7 @@ def _renumber_tags(
         n_all = facet_map.size_local + facet_map.num_ghosts
         known, numbers = _number_tags(mesh.comm, facet_tags, n_facet_tags)
         what = f"facet_tags of body {name!r}"
-        of_facet = _tags_of_entities(mesh.comm, what, facet_tags, numbers, n_all)
+        of_facet = _expand_tags(mesh.comm, what, facet_tags, numbers, n_all)
         facet_numbers[name] = numbers
         n_facet_tags += len(numbers)
         facets = _cell_facets(mesh)[:n_cells]
@@ -295,7 +293,7 @@ def _number_tags(
     return known, {tag: offset + 1 + i for i, tag in enumerate(known)}
 
 
-def _tags_of_entities(
+def _expand_tags(
     comm: MPI.Comm,
     what: str,
     tags: dolfinx.mesh.MeshTags | None,

@@ -402,12 +402,12 @@ def _fill_facet_rows(rows: Index, facets: Any, of_cells: Index, n_points: int) -
     _check_known_facets(tagged, number, ~np.isin(key, candidate_key), ids)
     tag_of_key = np.zeros(inverse.max() + 1, dtype=np.int64)
     tag_of_key[key] = number
-    ambiguous = np.flatnonzero(tag_of_key[key] != number)
-    if len(ambiguous):
-        first = ambiguous[0]
+    clashes = np.flatnonzero(tag_of_key[key] != number)
+    if len(clashes):
+        first = clashes[0]
         pair = ids[number[first] - 1], ids[tag_of_key[key[first]] - 1]
         raise ValueError(
-            f"{len(ambiguous)} facets have two tags, such as {tagged[first].tolist()} with {pair[0]} "
+            f"{len(clashes)} facets have two tags, such as {tagged[first].tolist()} with {pair[0]} "
             f"and {pair[1]}; leave them in one, and name both where both are meant, as "
             f"ContactSurface(mesh, tags, {list(pair)}) and ds({pair}) do"
         )

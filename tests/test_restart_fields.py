@@ -12,7 +12,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from fenics_contact import compat
-from fenics_contact.histories.point_matching import node_places, rows_of
+from fenics_contact.histories.point_matching import locate_nodes, nodal_values
 from scenes.comparing import close, gathered, owned, raised_everywhere, shared_folder
 from scenes.elasticity import strain
 from scenes.histories import Press, differences
@@ -49,11 +49,11 @@ def wave(x: np.ndarray, k: float) -> np.ndarray:
 def fill(fields: list[fem.Function], k: float) -> None:
     """Values that follow from the place, the component, the cell beside and ``k``."""
     for i, field in enumerate(fields):
-        places = node_places(field.function_space)
+        places = locate_nodes(field.function_space)
         d = places.shape[1] // 2
         x = np.zeros((len(places), 3))
         x[:, :d] = places[:, :d] + 0.1 * places[:, d:]
-        values = rows_of(field)
+        values = nodal_values(field)
         for j in range(values.shape[1]):
             values[:, j] = wave(x, k + i + 0.3 * j)
         field.x.scatter_forward()

@@ -1,1 +1,1 @@
-"""Increments one after another, and how they go on in another run."""
+"""Load histories: increments, checkpoints, tables, reports."""

@@ -2,7 +2,7 @@
 
 The file is an archive of NumPy arrays. DOLFINx's own writers (ADIOS2, HDF5) store functions on the
 cells of a mesh, but the history is defined at quadrature points of facets. Every value is stored
-with its location (`places`), together with a fingerprint of the problem (`fingerprint`).
+with its location (`point_matching`), and with a fingerprint of the problem (`fingerprint`).
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from fenics_contact.histories.checkpoint_file import (
     write_file,
 )
 from fenics_contact.histories.fingerprint import (
-    changed_data,
-    data_of,
-    data_words,
-    fixed_words,
+    compare_data,
+    compare_model,
+    describe_data,
+    describe_model,
+    point_data,
     probe,
-    why_another_scene,
 )
 from fenics_contact.histories.point_matching import (
-    find,
+    column_layout,
+    count_coincident,
     gather,
-    layout_of,
-    n_shared,
-    node_places,
-    parts_of,
-    point_places,
-    positions,
-    rows_of,
-    set_rows,
-    unpack,
+    locate_nodes,
+    locate_points,
+    match_values,
+    nodal_values,
+    node_coordinates,
+    set_nodal_values,
+    split_columns,
+    split_unknowns,
 )
 from fenics_contact.parallel import collective_errors, raise_collectively
 from fenics_contact.problem import ContactProblem
@@ -68,11 +68,11 @@ logger = logging.getLogger("fenics_contact")
 def exists(problem: ContactProblem, path: str | Path) -> bool:
     """Return whether a file of that name exists on rank 0. Collective."""
     comm = problem.u.function_space.mesh.comm
-    found = None
+    file_exists = None
     with collective_errors(comm):
         if comm.rank == 0:
-            found = Path(path).exists()
-    return bool(comm.bcast(found))
+            file_exists = Path(path).exists()
+    return bool(comm.bcast(file_exists))
 
 
 def save(
@@ -106,27 +106,28 @@ def save(
     comm = problem.u.function_space.mesh.comm
     check_fields(problem, state_fields)
     check_places(problem)
-    rows = _in_units(problem, problem.committed_rows())
-    anew = [contact.contact_kinematics.updates_pairs for contact in problem.contacts]
+    rows = _convert_units(problem, problem.committed_rows())
+    updated = [contact.contact_kinematics.updates_pairs for contact in problem.contacts]
     arrays = {
         "numbers": np.array(numbers, dtype=np.float64),
-        "state": np.array([problem.increment, problem.expected_increments, *anew], np.float64),
+        "state": np.array([problem.increment, problem.expected_increments, *updated], np.float64),
         "motions": np.stack([problem.full.unknowns.motions(row) for row in rows]),
         **probe(problem),
     }
-    for part in parts_of(problem):
+    for part in split_unknowns(problem):
         nodes = rows[:, part.dofs].reshape(len(rows), -1, part.space.dofmap.bs)
-        arrays[part.name] = gather(comm, node_places(part.space), *nodes)
+        arrays[part.name] = gather(comm, locate_nodes(part.space), *nodes)
     scene: dict[str, Any] = {"format": FORMAT, "notes": notes, "contacts": {}}
-    scene["fixed"], scene["data"] = fixed_words(problem, state_fields), data_words(problem)
+    scene["fixed"], scene["data"] = describe_model(problem, state_fields), describe_data(problem)
     for contact in problem.contacts:
-        data, values = data_of(contact), dict(contact.values.arrays)
-        scene["contacts"][contact.name] = layout_of(data), layout_of(values)
-        places = point_places(contact)
-        arrays[f"contact {contact.name}"] = gather(comm, places, contact.history.rows(), data)
-        arrays[f"values {contact.name}"] = gather(comm, places, values)
+        data, values = point_data(contact), dict(contact.values.arrays)
+        scene["contacts"][contact.name] = column_layout(data), column_layout(values)
+        points = locate_points(contact)
+        arrays[f"contact {contact.name}"] = gather(comm, points, contact.history.rows(), data)
+        arrays[f"values {contact.name}"] = gather(comm, points, values)
     for number, field in enumerate(state_fields):
-        arrays[f"field {number}"] = gather(comm, node_places(field.function_space), rows_of(field))
+        nodes = locate_nodes(field.function_space)
+        arrays[f"field {number}"] = gather(comm, nodes, nodal_values(field))
     with collective_errors(comm):
         if comm.rank == 0:
             for name, array in arrays.items():
@@ -204,12 +205,12 @@ def check_fields(problem: ContactProblem, state_fields: Sequence[fem.Function]) 
             raise ValueError(f"{what} is on a mesh with another communicator; use the problem's")
         try:
             space.tabulate_dof_coordinates()
-            whole = field.x.array.size == n_nodes * dofmap.index_map_bs
-            pointwise = whole and dofmap.bs == dofmap.index_map_bs
-            positions(space)
+            is_collapsed = field.x.array.size == n_nodes * dofmap.index_map_bs
+            has_nodal_dofs = is_collapsed and dofmap.bs == dofmap.index_map_bs
+            node_coordinates(space)
         except (RuntimeError, ValueError):
-            pointwise = False
-        if not pointwise:
+            has_nodal_dofs = False
+        if not has_nodal_dofs:
             raise ValueError(
                 f"{what} is in {space.ufl_element()}, whose dofs are not values at points; "
                 "interpolate it to a Lagrange or quadrature space, and parts of a mixed function "
@@ -217,7 +218,7 @@ def check_fields(problem: ContactProblem, state_fields: Sequence[fem.Function]) 
             )
 
 
-_told_apart: weakref.WeakSet[ContactProblem] = weakref.WeakSet()
+_problems_with_distinct_nodes: weakref.WeakSet[ContactProblem] = weakref.WeakSet()
 
 
 def check_places(problem: ContactProblem) -> None:
@@ -228,17 +229,18 @@ def check_places(problem: ContactProblem) -> None:
     Raises:
         ValueError: Two nodes coincide, in cells that coincide; raised on all ranks.
     """
-    if problem in _told_apart:
+    if problem in _problems_with_distinct_nodes:
         return
     comm = problem.u.function_space.mesh.comm
-    shared = n_shared(comm, node_places(parts_of(problem)[0].space), problem.full.scales.mesh_size)
-    if shared:
+    locations = locate_nodes(split_unknowns(problem)[0].space)
+    n_equal = count_coincident(comm, locations, problem.full.scales.mesh_size)
+    if n_equal:
         raise ValueError(
-            f"{shared} nodes of the mesh coincide with others, in cells that coincide, so that a "
+            f"{n_equal} nodes of the mesh coincide with others, in cells that coincide, so that a "
             "checkpoint could not distinguish their values; remove the duplicate cells, or use no "
             "checkpoint"
         )
-    _told_apart.add(problem)
+    _problems_with_distinct_nodes.add(problem)
 
 
 def read(problem: ContactProblem, path: str | Path) -> StoredCheckpoint:
@@ -249,11 +251,11 @@ def read(problem: ContactProblem, path: str | Path) -> StoredCheckpoint:
         OSError: The file cannot be read; raised on all ranks.
     """
     comm, path = problem.u.function_space.mesh.comm, Path(path)
-    found = None
+    content = None
     with collective_errors(comm):
         if comm.rank == 0:
-            found = read_file(path)
-    scene, arrays = comm.bcast(found)
+            content = read_file(path)
+    scene, arrays = comm.bcast(content)
     return StoredCheckpoint(path, scene, arrays)
 
 
@@ -283,38 +285,38 @@ def take_up(
     """
     comm = problem.u.function_space.mesh.comm
     check_fields(problem, state_fields)
-    refuse(stored, why_another_scene(stored, problem, state_fields))
+    refuse(stored, compare_model(stored, problem, state_fields))
     size = problem.full.scales.mesh_size
     motions = stored.arrays["motions"]
     rows = np.zeros((len(motions), problem.full.unknowns.n_dofs))
-    for part in parts_of(problem):
-        nodes = find(comm, stored, part.name, node_places(part.space), size)
-        # A rank may have no nodes, of which no shape can be told.
+    for part in split_unknowns(problem):
+        nodes = match_values(comm, stored, part.name, locate_nodes(part.space), size)
+        # reshape(-1) would be ambiguous on ranks without nodes.
         width = nodes.shape[1] // len(motions)
         by_row = nodes.reshape(len(nodes), len(motions), width).swapaxes(0, 1)
         rows[:, part.dofs] = by_row.reshape(len(motions), len(nodes) * width)
     joined = (problem.full.unknowns.joined(row, motions[i]) for i, row in enumerate(rows))
-    committed = _in_units(problem, np.stack(list(joined)), back=True)
+    committed = _convert_units(problem, np.stack(list(joined)), back=True)
     points, given = [], []
     for contact in problem.contacts:
-        places, (data, layout) = point_places(contact), stored.scene["contacts"][contact.name]
-        found = find(comm, stored, f"contact {contact.name}", places, size)
+        locations, (data, layout) = locate_points(contact), stored.scene["contacts"][contact.name]
+        matched = match_values(comm, stored, f"contact {contact.name}", locations, size)
         n_history = contact.history.rows().shape[1]
-        given.append(unpack(found[:, n_history:], data))
-        values = unpack(find(comm, stored, f"values {contact.name}", places, size), layout)
-        points.append((found[:, :n_history], values))
-    own = []
+        given.append(split_columns(matched[:, n_history:], data))
+        values = match_values(comm, stored, f"values {contact.name}", locations, size)
+        points.append((matched[:, :n_history], split_columns(values, layout)))
+    field_values = []
     for number, field in enumerate(state_fields):
-        places = node_places(field.function_space)
-        own.append(find(comm, stored, f"field {number}", places, size))
-    before = [field.x.array.copy() for field in state_fields]
+        locations = locate_nodes(field.function_space)
+        field_values.append(match_values(comm, stored, f"field {number}", locations, size))
+    previous = [field.x.array.copy() for field in state_fields]
     try:
         if loads is not None:
             loads()
-        for field, row in zip(state_fields, own, strict=True):
-            set_rows(field, row)
+        for field, values_at_nodes in zip(state_fields, field_values, strict=True):
+            set_nodal_values(field, values_at_nodes)
         with problem.at_state(committed[0]):
-            differences = changed_data(stored, problem, committed, given)
+            differences = compare_data(stored, problem, committed, given)
         if on_mismatch == "refuse":
             refuse(
                 stored,
@@ -323,7 +325,7 @@ def take_up(
             )
     except BaseException as error:
         raise_collectively(comm, error)
-        for field, array in zip(state_fields, before, strict=True):
+        for field, array in zip(state_fields, previous, strict=True):
             field.x.array[:] = array
         raise
     if differences and comm.rank == 0:
@@ -333,10 +335,10 @@ def take_up(
     problem.set_committed(committed, stored.arrays["state"], points)
 
 
-def _in_units(problem: ContactProblem, rows: Array, *, back: bool = False) -> Array:
-    """Rows of a committed state, those at dofs in the user's units, or ``back`` from them."""
-    bulk, n, found = problem.full.bulk, problem.full.unknowns.n_dofs, rows.copy()
+def _convert_units(problem: ContactProblem, rows: Array, *, back: bool = False) -> Array:
+    """Convert rows of a committed state at dofs to the user's units, or ``back`` from them."""
+    bulk, n, converted = problem.full.bulk, problem.full.unknowns.n_dofs, rows.copy()
     for i in range(5):  # two rows of displacements, three of forces
         convert = bulk.from_units if (i < 2) != back else bulk.in_units
-        found[i, :n] = convert(rows[i, :n])
-    return found
+        converted[i, :n] = convert(rows[i, :n])
+    return converted

@@ -1,4 +1,4 @@
-"""The file of a checkpoint: an archive of NumPy arrays, its digest, and what is refused of it."""
+"""Checkpoint files: an archive of NumPy arrays with its SHA-256 checksum, and their checks."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from fenics_contact.types import Array
 __all__ = ["FORMAT", "StoredCheckpoint", "check_finite", "read_file", "refuse", "write_file"]
 
 FORMAT = 9
-# The file's end: these words, and the digest of all before them.
-_MARK = b"\nfenics_contact checkpoint, sha256 "
+# Trailer of a file, followed by the checksum of everything before it.
+_TRAILER = b"\nfenics_contact checkpoint, sha256 "
 _REMEDY = "remove it to start again"
 
 
@@ -29,7 +29,7 @@ class StoredCheckpoint:
 
     Attributes:
         path: The file.
-        scene: The fingerprint of the problem in words, and other data that are no arrays.
+        scene: Fingerprint of the problem (strings) and other data that are not arrays.
         arrays: Arrays by name.
     """
 
@@ -39,50 +39,50 @@ class StoredCheckpoint:
 
     @property
     def numbers(self) -> list[float]:
-        """The caller's numbers."""
+        """Numbers of the caller."""
         return [float(value) for value in self.arrays["numbers"]]
 
     @property
     def notes(self) -> Any:
-        """The caller's notes."""
+        """Notes of the caller."""
         return self.scene["notes"]
 
 
 def write_file(path: Path, scene: dict[str, Any], arrays: dict[str, Array]) -> None:
-    """Write the archive, read it back, and put it in place.
+    """Write a checkpoint file atomically.
 
     Raises:
-        OSError: It cannot be written, or is not what was written. The file before it stays.
+        OSError: The file cannot be written, or has other content when it is read back. An existing
+            file is unchanged.
     """
     content = _pack(scene, arrays)
     with files.atomic_write(path) as temporary:
         with open(temporary, "wb") as file:
             file.write(content)
-        # Whether it can be gone on from is better known now than when it is needed.
         if temporary.read_bytes() != content:
             raise OSError(f"{path} differs from what was written: check the disk")
 
 
 def _pack(scene: dict[str, Any], arrays: dict[str, Array]) -> bytes:
-    """The archive, and how it ends."""
+    """Return the archive and its trailer."""
     words = np.frombuffer(json.dumps(scene).encode(), dtype=np.uint8)
     archive = io.BytesIO()
     np.savez(archive, allow_pickle=False, scene=words, **arrays)
     content = archive.getvalue()
-    return content + _MARK + hashlib.sha256(content).hexdigest().encode()
+    return content + _TRAILER + hashlib.sha256(content).hexdigest().encode()
 
 
 def read_file(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Scene and arrays of a file.
+    """Read scene and arrays of a checkpoint file.
 
     Raises:
-        ValueError: It is damaged, or none of this format, or no file at all.
-        OSError: It cannot be read.
+        ValueError: The file is damaged, or no checkpoint of this format.
+        OSError: The file cannot be read.
     """
     files.check_file(path)
     content = path.read_bytes()
-    end = len(content) - len(_MARK) - 64
-    if end < 0 or content[end : end + len(_MARK)] != _MARK:
+    end = len(content) - len(_TRAILER) - 64
+    if end < 0 or content[end : end + len(_TRAILER)] != _TRAILER:
         raise ValueError(
             f"{path} is no checkpoint of this version, or truncated: its end is missing; replace "
             f"it by a copy, or {_REMEDY}"
@@ -95,12 +95,12 @@ def read_file(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
         with np.load(io.BytesIO(content[:end]), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         scene = json.loads(arrays.pop("scene").tobytes())
-        found = scene["format"]
-    except Exception as error:  # whatever the archive's reader makes of it
+        version = scene["format"]
+    except Exception as error:  # NumPy's reader raises errors of many types
         raise ValueError(f"{path} is no checkpoint ({error}); {_REMEDY}") from error
-    if found != FORMAT:
+    if version != FORMAT:
         raise ValueError(
-            f"{path} is a checkpoint of format {found!r}, but this version reads {FORMAT}; use "
+            f"{path} is a checkpoint of format {version!r}, but this version reads {FORMAT}; use "
             f"the version that wrote it, or {_REMEDY}"
         )
     missing = sorted({"notes", "contacts", "fixed", "data"} - set(scene))
@@ -118,23 +118,17 @@ def read_file(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
 
 
 def check_finite(name: str, array: Array, where: str) -> None:
-    """Refuse values that are not finite: of a state all, of results and the caller's some.
+    """Raise ValueError, with the text ``where``, if a state array has values that are not finite.
 
-    Raises:
-        ValueError: It names the array, what it is of, and what follows.
+    Numbers of the caller may be infinite (the largest increment), results ("values ...") anything.
     """
-    # Where an increment is cut is infinite where none was; what is evaluated may be anything.
-    wrong = np.isnan(array) if name == "numbers" else ~np.isfinite(array)
-    if wrong.any() and not name.startswith("values "):
+    invalid = np.isnan(array) if name == "numbers" else ~np.isfinite(array)
+    if invalid.any() and not name.startswith("values "):
         raise ValueError(f"{name!r} has values that are not finite: {where}")
 
 
 def refuse(stored: StoredCheckpoint, differences: Sequence[str], remedy: str = "") -> None:
-    """Refuse a file that differs from what is wanted.
-
-    Raises:
-        ValueError: It lists the differences, if there are any, and the remedy.
-    """
+    """Raise ValueError with the differences and the remedy, if there are differences."""
     if differences:
-        what = "; ".join(differences)
-        raise ValueError(f"{stored.path} is not of this problem: {what}; {_REMEDY}{remedy}")
+        listed = "; ".join(differences)
+        raise ValueError(f"{stored.path} is not of this problem: {listed}; {_REMEDY}{remedy}")

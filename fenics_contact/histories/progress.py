@@ -1,4 +1,4 @@
-"""How far a history is, and the time left, in a terminal."""
+"""Progress bar of a load history."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ logger = logging.getLogger("fenics_contact")
 
 
 class ProgressBar(logging.Filter):
-    """A bar of tqdm that is there while increments are solved, and gone in between.
+    """Progress bar (tqdm) on the first rank, visible while an increment is solved.
 
-    So what a script prints of a step stands on lines of its own, and so do lines of the log, before
-    which it is wiped off. It counts the way of the load from start to end, which cuts do not
-    change. Where there is neither a terminal nor a notebook nothing is shown. Of the first rank.
+    It shows the completed fraction of the load path and the remaining time, in a terminal or a
+    notebook. It is cleared before log records and between increments.
 
     Args:
-        words: At its head; may be empty.
+        title: Text in front of the bar; may be empty.
+        start: Load parameter at the start of the history.
+        end: Load parameter at its end.
 
     Raises:
-        ValueError: There is no tqdm.
+        ValueError: tqdm is not installed.
     """
 
-    def __init__(self, words: str, start: float, end: float) -> None:
+    def __init__(self, title: str, start: float, end: float) -> None:
         super().__init__()
         try:
             from tqdm import tqdm
@@ -35,32 +36,32 @@ class ProgressBar(logging.Filter):
             raise ValueError(
                 "progress needs tqdm, which is not installed: install it, or omit progress"
             ) from error
-        self._make, self._words = tqdm, f"{words}: " if words else ""
-        self._start, self._way = start, end - start
+        self._create_bar, self._title = tqdm, f"{title}: " if title else ""
+        self._start, self._load_range = start, end - start
         self._bar: Any = None
 
-    def lead(self, load: float) -> None:
-        """Say which load is tried; the first is where the history begins, or goes on."""
+    def start_bar(self, load: float) -> None:
+        """Create the bar at the first call, with the load at which the history starts."""
         if self._bar is not None:
             return
-        self._bar = self._make(
+        self._bar = self._create_bar(
             total=1.0,
-            initial=self._share(load),
-            desc=self._words,
+            initial=self._fraction(load),
+            desc=self._title,
             bar_format="{desc}{percentage:3.0f}%|{bar:20}|{postfix}, {elapsed}<{remaining}",
             postfix=f"load {load:g}",
             mininterval=0,
             miniters=0,
-            # None: silent where there is no terminal; a notebook is none, and shows it.
+            # With None tqdm is silent without a terminal, and therefore in notebooks.
             disable=False if "ipykernel" in sys.modules else None,
         )
 
-    def _share(self, load: float) -> float:
-        return (load - self._start) / self._way
+    def _fraction(self, load: float) -> float:
+        return (load - self._start) / self._load_range
 
     @contextmanager
-    def shown(self) -> Iterator[None]:
-        """Show it inside of the block; it stays where the block fails or ends the history."""
+    def show(self) -> Iterator[None]:
+        """Show the bar inside the block; close it if the block fails or ends the history."""
         logger.addFilter(self)
         try:
             if self._bar is not None:
@@ -73,20 +74,20 @@ class ProgressBar(logging.Filter):
         finally:
             logger.removeFilter(self)
 
-    def reach(self, load: float) -> None:
-        """Count the way to a load that was committed, and make room for what the script says."""
+    def update(self, load: float) -> None:
+        """Advance the bar to a committed load, and clear it for the output of the script."""
         self._bar.set_postfix_str(f"load {load:g}", refresh=False)
-        self._bar.update(self._share(load) - self._bar.n)
+        self._bar.update(self._fraction(load) - self._bar.n)
         self._bar.clear()
 
-    def wipe(self) -> None:
-        """Take it away: the script has left the history."""
+    def remove(self) -> None:
+        """Remove the bar, because the script has left the history."""
         if self._bar is not None:
             self._bar.leave = False
             self._bar.close()
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Let every record through, on a line of its own."""
+        """Clear the bar before a log record; accept every record."""
         if self._bar is not None:
             self._bar.clear()
         return True

@@ -1,8 +1,7 @@
-"""Signatures of UFL: a word that tells the code of a law or of an obstacle from other code.
+"""Signatures of UFL expressions: hashes that identify the code of a law or of an obstacle.
 
-It depends on neither process, rank, mesh nor on how many functions were made before: laws and
-obstacles are written in symbols of their own, which have names, and are hashed node by node. What
-the symbols stand for, the data, is compared by its values elsewhere.
+They are independent of process, rank, mesh and UFL's counters: laws and obstacles are evaluated
+with named symbols, and hashed node by node. The data behind the symbols are compared elsewhere.
 """
 
 from __future__ import annotations
@@ -24,38 +23,38 @@ from fenics_contact.obstacles.base import Obstacle
 
 __all__ = ["signature_of_law", "signature_of_obstacle"]
 
-# Digits of numbers in an obstacle, whose last ones may be round-off of where they come from.
+# Significant digits of numbers in an obstacle; further ones may be round-off.
 _DIGITS = 12
 
 
 class _Symbols:
-    """Named symbols, numbered from one count on: UFL orders the terms of a sum by these."""
+    """Named symbols with fixed counts, by which UFL sorts the terms of a sum."""
 
-    _FIRST = 10_000  # all numbers have as many digits, by which UFL may order, too
+    _FIRST_COUNT = 10_000  # counts of equal length sort in the same order as strings
 
     def __init__(self, gdim: int) -> None:
-        """Take an abstract mesh of a dimension."""
+        """Create an abstract mesh of dimension ``gdim``."""
         cell = "triangle" if gdim == 2 else "tetrahedron"
         self._mesh = ufl.Mesh(basix.ufl.element("Lagrange", cell, 1, shape=(gdim,)))
         self.names: dict[Any, str] = {}
 
     def new(self, name: str, *shape: int) -> Any:
-        """A symbol of a shape."""
-        symbol = ufl.Constant(self._mesh, shape, count=self._FIRST + len(self.names))
+        """Create a symbol of a shape."""
+        symbol = ufl.Constant(self._mesh, shape, count=self._FIRST_COUNT + len(self.names))
         self.names[symbol] = name
         return symbol
 
 
 def signature_of_law(law: Law, gdim: int, *, multipliers: bool) -> str:
-    """A word that differs where anything that a law says as UFL, or of its kind, differs.
+    """Return a hash of all UFL expressions and properties of a law.
 
     Args:
-        law: The law; values of its parameters do not count.
+        law: The law; the values of its parameters do not affect the hash.
         gdim: Dimension of space.
         multipliers: Whether it is enforced by multipliers.
     """
     symbols = _Symbols(gdim)
-    felt = PointKinematics(
+    kinematics = PointKinematics(
         symbols.new("gap"),
         symbols.new("normal", gdim),
         symbols.new("tangential displacement", gdim) if law.has_tangential else None,
@@ -67,28 +66,29 @@ def signature_of_law(law: Law, gdim: int, *, multipliers: bool) -> str:
         name: symbols.new(f"parameter {name}", *(gdim,) * (name == "direction"))
         for name in law.parameters()
     }
-    response = law.contact_traction(felt, given)
-    said = [response.normal_traction, *response.slip]
-    said.append(law.stored(felt, response, given))
+    response = law.contact_traction(kinematics, given)
+    terms = [response.normal_traction, *response.slip]
+    terms.append(law.stored(kinematics, response, given))
     if law.has_own_normal:
-        said += [law.normal_potential(felt, given), law.normal_stiffness(felt, given)]
+        terms += [law.normal_potential(kinematics, given), law.normal_stiffness(kinematics, given)]
     if law.has_tangential:
-        said += [response.traction, law.tangential_stiffness(felt, given)]
+        terms += [response.traction, law.tangential_stiffness(kinematics, given)]
     if law.has_friction:
         traction, pressure = symbols.new("present traction", gdim), symbols.new("pressure")
-        said += [response.friction_bound, law.friction_bound(felt, pressure, given)]
-        said += law.yield_functions(felt, traction, pressure, given)
-        said += [law.elastic_displacement(felt, traction, given)]
-        said += [law.dissipated(felt, response, given)]
+        terms += [response.friction_bound, law.friction_bound(kinematics, pressure, given)]
+        terms += law.yield_functions(kinematics, traction, pressure, given)
+        terms += [law.elastic_displacement(kinematics, traction, given)]
+        terms += [law.dissipated(kinematics, response, given)]
     kind = law.has_tension, law.has_potential, law.has_normal_stiffness, law.is_physical
-    return _word([*map(str, kind), *_hashes(said, symbols.names)])
+    return _hash([*map(str, kind), *_hash_components(terms, symbols.names)])
 
 
 def signature_of_obstacle(obstacle: Obstacle, gdim: int) -> str:
-    """A word that differs where gap or direction of an obstacle are other functions of the place.
+    """Return a hash of gap and direction of an obstacle as functions of position.
 
     Args:
-        obstacle: Of which numbers count by their values, constants and functions do not.
+        obstacle: The obstacle; values of numbers affect the hash, those of constants and functions
+            do not.
         gdim: Dimension of space.
     """
     symbols = _Symbols(gdim)
@@ -100,84 +100,83 @@ def signature_of_obstacle(obstacle: Obstacle, gdim: int) -> str:
         return ufl.as_ufl(float(rounded)) if rounded.ndim == 0 else ufl.as_tensor(rounded.tolist())
 
     placement = obstacle.placed(symbols.new("place", gdim), to_ufl)
-    return _word(_hashes([placement.gap, placement.direction], symbols.names))
+    return _hash(_hash_components([placement.gap, placement.direction], symbols.names))
 
 
-def _word(parts: Iterable[str]) -> str:
+def _hash(parts: Iterable[str]) -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
-_ZERO = _word(["0"])
+_ZERO = _hash(["0"])
 
 
-def _sum(terms: Sequence[str]) -> str:
-    """Of a sum, by the hashes of its terms."""
-    some = sorted(term for term in terms if term != _ZERO)
-    return some[0] if len(some) == 1 else _word(["Sum", *some]) if some else _ZERO
+def _hash_sum(terms: Sequence[str]) -> str:
+    """Hash a sum of terms with these hashes, in any order."""
+    nonzero = sorted(term for term in terms if term != _ZERO)
+    return nonzero[0] if len(nonzero) == 1 else _hash(["Sum", *nonzero]) if nonzero else _ZERO
 
 
-def _hashes(expressions: Iterable[Any], names: dict[Any, str]) -> list[str]:
-    """Of each component of expressions a hash."""
-    components, found = _Components(names), []
+def _hash_components(expressions: Iterable[Any], names: dict[Any, str]) -> list[str]:
+    """Return the hash of each component of expressions."""
+    components, hashes = _Components(names), []
     for expression in expressions:
         plain = apply_algebra_lowering(ufl.as_ufl(expression))
-        for node in unique_post_traversal(plain):  # no chain is as deep as Python's stack
+        for node in unique_post_traversal(plain):  # bottom-up, to bound the recursion depth
             if isinstance(node, classes.Operator) and not node.ufl_shape:
                 if not node.ufl_free_indices:
                     components.hash(node, (), {})
-        for place in np.ndindex(plain.ufl_shape):
-            found.append(components.hash(plain, place, {}))
-    return found
+        for component in np.ndindex(plain.ufl_shape):
+            hashes.append(components.hash(plain, component, {}))
+    return hashes
 
 
 class _Components:
-    """Hashes of scalar components of tensors, whose indices are all numbers.
+    """Hashes of scalar components of tensors, with numbers for all indices.
 
-    Releases of UFL differ in where they write an index, and order sums and products by numbers of
-    the process: here there is no index, and terms and factors are sorted.
+    They are independent of how releases of UFL place indices and sort terms and factors.
     """
 
     def __init__(self, names: dict[Any, str]) -> None:
-        """Take the names of symbols."""
+        """Store the names of symbols."""
         self._names = names
-        self._known: dict[Any, str] = {}
+        self._cache: dict[Any, str] = {}
 
-    def hash(self, node: Any, place: tuple[int, ...], bound: dict[int, int]) -> str:
-        """Of the component at a place.
+    def hash(self, node: Any, component: tuple[int, ...], bound: dict[int, int]) -> str:
+        """Return the hash of a component.
 
         Args:
             node: An expression without products of tensors.
-            place: Its indices, as many as the expression has axes.
-            bound: Values of its free indices, by their numbers.
+            component: Indices of the component, one per axis of the expression.
+            bound: Values of its free indices, by their counts.
         """
         free = getattr(node, "ufl_free_indices", ())
-        key = node, place, tuple(bound[i] for i in free)
-        if key not in self._known:
-            self._known[key] = self._written(node, place, bound)
-        return self._known[key]
+        key = node, component, tuple(bound[i] for i in free)
+        if key not in self._cache:
+            self._cache[key] = self._compute_hash(node, component, bound)
+        return self._cache[key]
 
-    def _written(self, node: Any, place: tuple[int, ...], bound: dict[int, int]) -> str:
+    def _compute_hash(self, node: Any, component: tuple[int, ...], bound: dict[int, int]) -> str:
         operands = node.ufl_operands
         match node:
             case _ if node in self._names:
-                return _word([f"{self._names[node]} {place}"])
+                return _hash([f"{self._names[node]} {component}"])
             case classes.Zero():
                 return _ZERO
             case classes.ScalarValue():
-                return _word([f"{float(node):.15g}"])
+                return _hash([f"{float(node):.15g}"])
             case classes.Identity():
-                return _word(["1"]) if place[0] == place[1] else _ZERO
+                return _hash(["1"]) if component[0] == component[1] else _ZERO
             case classes.Variable():
-                return self.hash(operands[0], place, bound)
+                return self.hash(operands[0], component, bound)
             case classes.ListTensor():
-                return self.hash(operands[place[0]], place[1:], bound)
+                return self.hash(operands[component[0]], component[1:], bound)
             case classes.Indexed():
                 at = (
                     int(i) if isinstance(i, FixedIndex) else bound[i.count()] for i in operands[1]
                 )
                 return self.hash(operands[0], tuple(at), bound)
             case classes.ComponentTensor():
-                given = {i.count(): k for i, k in zip(operands[1], place, strict=True)}
+                given = {i.count(): k for i, k in zip(operands[1], component, strict=True)}
                 return self.hash(operands[0], (), bound | given)
             case classes.IndexSum():
                 (index,) = operands[1]
@@ -185,15 +184,15 @@ class _Components:
                     self.hash(operands[0], (), bound | {index.count(): k})
                     for k in range(node.dimension())
                 ]
-                return _sum(terms)
+                return _hash_sum(terms)
             case classes.Sum():
-                return _sum([self.hash(operand, place, bound) for operand in operands])
+                return _hash_sum([self.hash(operand, component, bound) for operand in operands])
             case classes.Product():
-                factors = [self.hash(operand, place, bound) for operand in operands]
-                return _ZERO if _ZERO in factors else _word(["Product", *sorted(factors)])
-        parts = [f"{type(node).__name__} {getattr(node, 'ufl_shape', ())} {place}"]
+                factors = [self.hash(operand, component, bound) for operand in operands]
+                return _ZERO if _ZERO in factors else _hash(["Product", *sorted(factors)])
+        parts = [f"{type(node).__name__} {getattr(node, 'ufl_shape', ())} {component}"]
         for operand in operands:
             shape = getattr(operand, "ufl_shape", ())
-            inside = [place] if shape and shape == node.ufl_shape else np.ndindex(shape)
+            inside = [component] if shape and shape == node.ufl_shape else np.ndindex(shape)
             parts += [self.hash(operand, at, bound) for at in inside]
-        return _word(parts)
+        return _hash(parts)
