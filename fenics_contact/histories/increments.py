@@ -30,15 +30,15 @@ from fenics_contact.surface.dependence import Dependence
 from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
 
-__all__ = ["increments", "reads"]
+__all__ = ["depends_on", "increments"]
 
 logger = logging.getLogger("fenics_contact")
 
-# Increments in a row without failure after which a cut one may grow again.
-_PATIENCE = 2
-# Towards a maximum of the load the displacement per load grows as 1/√(distance): from this factor
-# on, by the mean of the history, a maximum is named where increments fail.
-_LIMIT_POINT = 2.0
+# Number of successive increments without failure after which a cut increment size is doubled.
+_INCREMENTS_BEFORE_DOUBLING = 2
+# Near a limit point the displacement per load grows as 1/√(distance). From this multiple of its
+# mean over the history on, the error of a failed increment mentions a limit point.
+_LIMIT_RATIO = 2.0
 
 
 def increments(
@@ -125,14 +125,14 @@ def increments(
     """
     check_instance("problem", problem, ContactProblem)
     comm, set_load = problem.u.function_space.mesh.comm, _setter(load)
-    for name, place in (("start", start), ("end", end)):
-        if not (isinstance(place, Real) and np.isfinite(place)):
-            raise ValueError(f"{name} is {place!r}; it must be a finite number")
+    for name, value in (("start", start), ("end", end)):
+        if not (isinstance(value, Real) and np.isfinite(value)):
+            raise ValueError(f"{name} is {value!r}; it must be a finite number")
     if start == end:
         raise ValueError(f"start and end are both {start!r}; they must differ")
     ends = _ends(start, end, problem.increments_wanted if steps is None else steps)
-    whole = isinstance(recover_interior, int | np.integer) and recover_interior >= 1
-    if recover_interior not in ("every", "last") and not whole:
+    is_interval = isinstance(recover_interior, int | np.integer) and recover_interior >= 1
+    if recover_interior not in ("every", "last") and not is_interval:
         raise ValueError(
             f'recover_interior is {recover_interior!r}; it must be "every", "last", or an integer, '
             "at least 1"
@@ -174,7 +174,7 @@ def increments(
         with collective_errors(comm):
             set_load(value)
         if bar is not None:
-            bar.lead(value)
+            bar.start_bar(value)
 
     if not isinstance(csv, str | Path | None):
         raise ValueError(f"csv is {csv!r}; it must be the name of a file")
@@ -185,13 +185,13 @@ def increments(
         )
     if csv is not None:
         table = Table(Path(csv), problem, tuple(quantities(problem)) if estimate else ())
-    leg = _LoadSegment(float(start), ends, float(start), estimate)
-    every = max_cuts, checkpoint_every, recover_interior
-    made = _history(problem, apply, leg, file, every, list(state_fields), on_mismatch, table)
-    return _Started(made, comm, bar)
+    segment = _LoadSegment(float(start), ends, float(start), estimate)
+    options = max_cuts, checkpoint_every, recover_interior
+    history = _solve(problem, apply, segment, file, options, list(state_fields), on_mismatch, table)
+    return _Steps(history, comm, bar)
 
 
-def reads(problem: ContactProblem, constant: fem.Constant) -> bool:
+def depends_on(problem: ContactProblem, constant: fem.Constant) -> bool:
     """Return whether F, a Dirichlet condition or a contact of a problem depends on a constant.
 
     Collective.
@@ -199,7 +199,7 @@ def reads(problem: ContactProblem, constant: fem.Constant) -> bool:
     full = problem.full
     if constant in full.bulk.form.constants():
         return True
-    if any(_contact_reads(contact, constant) for contact in problem.contacts):
+    if any(_contact_depends_on(contact, constant) for contact in problem.contacts):
         return True
     value, prescribed = constant.value.copy(), list[Array]()
     try:
@@ -211,24 +211,24 @@ def reads(problem: ContactProblem, constant: fem.Constant) -> bool:
     return bool(full.unknowns.comm.allreduce(int(not np.array_equal(prescribed[0], prescribed[1]))))
 
 
-def _contact_reads(contact: Contact, constant: fem.Constant) -> bool:
-    """Return whether law, obstacle, gap or weight depend on a constant.
+def _contact_depends_on(contact: Contact, constant: fem.Constant) -> bool:
+    """Return whether law, obstacle, gap or weight depend on a constant, True if undecidable.
 
-    Returns True if that cannot be decided: for a `SampledObstacle` and for user-defined laws.
+    It is undecidable for a `SampledObstacle` and for user-defined laws.
     """
-    seen = is_built_in(contact.law) and not isinstance(contact.obstacle, SampledObstacle)
+    is_known = is_built_in(contact.law) and not isinstance(contact.obstacle, SampledObstacle)
     loads = [motion.load() for motion in contact.motions]
     return (
-        not seen
+        not is_known
         or contact.contact_kinematics.data.reads(constant)
         or any(f is constant for f in loads)
     )
 
 
 def _check_constant(problem: ContactProblem, load: fem.Constant, start: float, end: float) -> None:
-    """Warn of a load that nothing depends on, and of one that would jump. Collective."""
+    """Warn of a load constant without effect, and of a jump of the load. Collective."""
     comm, now = problem.u.function_space.mesh.comm, float(load.value)
-    if not reads(problem, load):
+    if not depends_on(problem, load):
         warn(
             comm,
             "load is a constant on which neither F, nor a Dirichlet condition, nor a contact "
@@ -243,35 +243,35 @@ def _check_constant(problem: ContactProblem, load: fem.Constant, start: float, e
         )
 
 
-class _Started(Iterator[Step]):
-    """Increments that are solved as they are asked for; warns if none ever is."""
+class _Steps(Iterator[Step]):
+    """Iterator over a load history, which warns if it is deleted before any iteration."""
 
     def __init__(
         self, steps: Generator[Step, None, None], comm: MPI.Comm, bar: ProgressBar | None
     ) -> None:
-        self._steps, self._comm, self._asked, self._bar = steps, comm, False, bar
+        self._steps, self._comm, self._is_used, self._bar = steps, comm, False, bar
 
     def __next__(self) -> Step:
-        self._asked = True
+        self._is_used = True
         if self._bar is None:
             return next(self._steps)
-        with self._bar.shown():
+        with self._bar.show():
             step = next(self._steps)
         assert step.load is not None
-        self._bar.reach(step.load)
+        self._bar.update(step.load)
         return step
 
     def close(self) -> None:
-        """End the history here, as for a generator: the last committed increment was the last."""
-        self._asked = True
+        """End the history after the last committed increment, as ``close`` of a generator."""
+        self._is_used = True
         self._steps.close()
         if self._bar is not None:
-            self._bar.wipe()
+            self._bar.remove()
 
     def __del__(self) -> None:
         if self._bar is not None:
-            self._bar.wipe()
-        if not self._asked:
+            self._bar.remove()
+        if not self._is_used:
             warn(
                 self._comm,
                 "increments(...) was called, but nothing was solved: iterate over the result, "
@@ -280,28 +280,28 @@ class _Started(Iterator[Step]):
             )
 
 
-def _history(
+def _solve(
     problem: ContactProblem,
     apply: Callable[[float], None],
-    leg: _LoadSegment,
+    segment: _LoadSegment,
     checkpoint: Path | None,
-    every: tuple[int, int, str | int],
+    options: tuple[int, int, str | int],
     fields: Sequence[fem.Function],
     on_mismatch: str,
     table: Table | None,
 ) -> Generator[Step, None, None]:
-    """What `increments` returns, its arguments checked. Collective."""
-    (max_cuts, checkpoint_every, field), comm = every, problem.u.function_space.mesh.comm
-    start, ends, estimate = leg.start, leg.ends, leg.estimate
+    """Solve, commit and save the increments of a load history. Collective."""
+    (max_cuts, checkpoint_every, recover), comm = options, problem.u.function_space.mesh.comm
+    start, ends, estimate = segment.start, segment.ends, segment.estimate
     end = ends[-1]
-    at = _Progress(start)
+    progress = _Progress(start)
     error = dict.fromkeys(quantities(problem), 0.0) if estimate else {}
-    calls, stored = _LoadProgramme([leg], True), None
+    programme, stored = _LoadProgramme([segment], True), None
     if checkpoint is not None:
-        calls, stored = _place(problem, checkpoint, leg)
-    if not calls.begun:
-        logger.info("%s: increments %s are done", checkpoint, leg)
-        apply(leg.reached)
+        programme, stored = _locate_segment(problem, checkpoint, segment)
+    if not programme.has_state:
+        logger.info("%s: increments %s are complete", checkpoint, segment)
+        apply(segment.reached)
         return
     if stored is None:
         problem.expected_increments = len(ends) * (3 if estimate else 1)
@@ -312,119 +312,119 @@ def _history(
             raise ValueError(
                 f"{checkpoint} was not written by such a load history; remove it to start again"
             )
-        at = _Progress(*stored.numbers[:n])
+        progress = _Progress(*stored.numbers[:n])
         error = dict(zip(error, stored.numbers[n:], strict=True))
         try:
             states.take_up(
                 problem,
                 stored,
-                loads=lambda: apply(at.load),
+                loads=lambda: apply(progress.load),
                 state_fields=fields,
                 on_mismatch=on_mismatch,
             )
         except BaseException:
             apply(start)
             raise
-        ends = ends[leg.passed() :]
-        logger.info("continuing from %s, at load %g", checkpoint, at.load)
+        ends = ends[segment.count_reached() :]
+        logger.info("continuing from %s, at load %g", checkpoint, progress.load)
     if checkpoint is not None:
-        _calls[problem][checkpoint.absolute()] = calls
-    watch = _Watch(problem, fields) if checkpoint is not None else None
+        _programmes[problem][checkpoint.absolute()] = programme
+    monitor = _UnsavedCoefficients(problem, fields) if checkpoint is not None else None
     if table is not None:
         table.begin()
 
     def write() -> None:
-        leg.reached = at.load
-        numbers = [*dataclasses.astuple(at), *error.values()]
+        segment.reached = progress.load
+        numbers = [*dataclasses.astuple(progress), *error.values()]
         assert checkpoint is not None
-        notes = [dataclasses.asdict(each) for each in calls.legs]
+        notes = [dataclasses.asdict(each) for each in programme.segments]
         states.save(problem, checkpoint, numbers, state_fields=fields, notes=notes)
 
     direction = 1.0 if end >= start else -1.0
-    unsaved = behind = 0
-    failed: list[Attempt] = []
-    halves: list[float] = []  # of an increment that was solved whole, with these results
-    whole: dict[str, float] = {}
+    n_unsaved = n_skipped = 0
+    failed_attempts: list[Attempt] = []
+    halves: list[float] = []  # ends of the halves of an increment solved in one step
+    one_step: dict[str, float] = {}  # results of that step
     for target in ends:
-        while direction * (target - at.load) > 0:
-            # A remainder that is next to nothing is taken along.
-            within = abs(target - at.load) <= 1.01 * at.largest
-            goal = target if within else at.load + direction * at.largest
+        while direction * (target - progress.load) > 0:
+            # A remainder of up to 1 % is included.
+            within = abs(target - progress.load) <= 1.01 * progress.max_size
+            goal = target if within else progress.load + direction * progress.max_size
             try:
                 if estimate and not halves:
                     apply(goal)
                     problem.solve()
-                    whole = quantities(problem)
+                    one_step = quantities(problem)
                     problem.restore()
-                    halves = [0.5 * (at.load + goal), goal]
+                    halves = [0.5 * (progress.load + goal), goal]
                 goal = halves[0] if halves else goal
-                wanted = goal == end or field == "every" or estimate or behind + 1 == field
+                is_due = goal == end or recover == "every" or estimate or n_skipped + 1 == recover
                 apply(goal)
-                step = problem.solve(recover_interior=wanted)
+                step = problem.solve(recover_interior=is_due)
             except BaseException as failure:
-                apply(at.load)
+                apply(progress.load)
                 halves = []
                 if not isinstance(failure, NotConverged):
                     raise
-                failed += failure.attempts
-                if at.cuts == max_cuts:
-                    failure.attempts = tuple(failed)
-                    failure.add(at.limit_point())
+                failed_attempts += failure.attempts
+                if progress.cuts == max_cuts:
+                    failure.attempts = tuple(failed_attempts)
+                    failure.add(progress.limit_point())
                     problem.complete()
                     raise
-                at.cut(abs(goal - at.load))
-                failed.append(Attempt("cut", 0, f"to {at.largest:g}"))
+                progress.cut(abs(goal - progress.load))
+                failed_attempts.append(Attempt("cut", 0, f"to {progress.max_size:g}"))
                 if comm.rank == 0:
                     logger.warning(
                         "increment %d, to load %g, did not converge: cut to size %g",
                         failure.increment,
                         goal,
-                        at.largest,
+                        progress.max_size,
                     )
                 continue
             problem.commit()
-            at.advance(goal, problem)
+            progress.advance(goal, problem)
             halves = halves[1:]
-            found = None
+            errors = None
             if estimate and not halves:
-                # Of first order in the size of the increments: half of the error of the whole one,
-                # which is as much as the difference, is left in the halves.
+                # The error is of first order in the increment size. That of the two halves is half
+                # of the error in one step, and equals the difference of the results.
                 now = quantities(problem)
-                error = {name: error[name] + whole[name] - now[name] for name in now}
-                found = dict(error)
-            behind = 0 if step.complete else behind + 1
-            unsaved += 1
-            tried, failed = (*failed, *step.attempts), []
-            step = dataclasses.replace(step, load=goal, attempts=tried, increment_error=found)
-            if table is not None:  # before the checkpoint, behind which rows are replaced
+                error = {name: error[name] + one_step[name] - now[name] for name in now}
+                errors = dict(error)
+            n_skipped = 0 if step.complete else n_skipped + 1
+            n_unsaved += 1
+            attempts, failed_attempts = (*failed_attempts, *step.attempts), []
+            step = dataclasses.replace(step, load=goal, attempts=attempts, increment_error=errors)
+            if table is not None:  # before the checkpoint: rows after a checkpoint are replaced
                 table.add(step)
-            # Halves belong together: between them the whole one's results would be lost.
-            due = checkpoint is not None and (
-                goal == end or (unsaved >= checkpoint_every and not halves)
+            # No checkpoint between two halves: the results of the single step would be lost.
+            save_now = checkpoint is not None and (
+                goal == end or (n_unsaved >= checkpoint_every and not halves)
             )
-            if due:
-                unsaved = behind = 0
-            if due and not fields:
+            if save_now:
+                n_unsaved = n_skipped = 0
+            if save_now and not fields:
                 write()
-            leg.reached = goal
-            if watch is not None:
-                watch.look()
+            segment.reached = goal
+            if monitor is not None:
+                monitor.record()
             yield step
-            if watch is not None:
-                watch.compare()
-            if due and fields:
-                apply(goal)  # what the loop may have set otherwise
+            if monitor is not None:
+                monitor.check()
+            if save_now and fields:
+                apply(goal)  # the loop may have changed the load
                 write()
 
 
 @dataclasses.dataclass
 class _LoadSegment:
-    """What one call of `increments` asks for.
+    """The load path of one call of `increments`.
 
     Attributes:
         start: Load parameter at its start.
-        ends: Those at the ends of its increments.
-        reached: Where it stands.
+        ends: Load parameters at the ends of its increments.
+        reached: Load parameter of the last committed increment.
         estimate: Whether errors are estimated.
     """
 
@@ -433,34 +433,34 @@ class _LoadSegment:
     reached: float
     estimate: bool
 
-    def passed(self, reached: float | None = None) -> int:
-        """How many of its ends lie behind a load parameter, by default where it stands."""
+    def count_reached(self, reached: float | None = None) -> int:
+        """Return the number of ends up to a load parameter, by default the one reached."""
         reached = self.reached if reached is None else reached
-        return sum(self._way(end - reached) <= self._round_off() for end in self.ends)
+        return sum(self._signed(end - reached) <= self._round_off() for end in self.ends)
 
-    def _way(self, difference: float) -> float:
+    def _signed(self, difference: float) -> float:
         return difference if self.ends[-1] >= self.start else -difference
 
     def _round_off(self) -> float:
         return NEGLIGIBLE * abs(self.ends[-1] - self.start)
 
     def is_done(self) -> bool:
-        return self.passed() == len(self.ends)
+        return self.count_reached() == len(self.ends)
 
-    def same(self, other: _LoadSegment, *, up_to: float | None = None) -> bool:
-        """Whether another one asks for the same; if given, up to a load parameter."""
+    def is_equal(self, other: _LoadSegment, *, up_to: float | None = None) -> bool:
+        """Return whether another segment has the same increments; if given, up to a load."""
         n, m = len(self.ends), len(other.ends)
         if up_to is not None:
-            within = -self._round_off() <= self._way(up_to - self.start)
-            within &= self._way(up_to - self.ends[-1]) <= self._round_off()
+            within = -self._round_off() <= self._signed(up_to - self.start)
+            within &= self._signed(up_to - self.ends[-1]) <= self._round_off()
             if not within:
                 return False
-            n, m = self.passed(up_to), other.passed(up_to)
+            n, m = self.count_reached(up_to), other.count_reached(up_to)
         mine, theirs = [self.start, *self.ends[:n]], [other.start, *other.ends[:m]]
         return n == m and np.allclose(mine, theirs, rtol=0.0, atol=self._round_off())
 
     def __str__(self) -> str:
-        """What it asks for, in words."""
+        """Describe the load path for messages."""
         ends = ", ".join(f"{end:g}" for end in self.ends[:6])
         more = ", …" if len(self.ends) > 6 else ""
         return f"from {self.start:g} to {self.ends[-1]:g} by {len(self.ends)} ({ends}{more})"
@@ -468,97 +468,101 @@ class _LoadSegment:
 
 @dataclasses.dataclass
 class _LoadProgramme:
-    """The calls of `increments` for a problem and a file.
+    """The successive calls of `increments` for a problem and a checkpoint file.
 
     Attributes:
-        legs: What they asked for.
-        begun: Whether the problem has a state of this path; else all of them were done in the file.
+        segments: Their load paths.
+        has_state: Whether the problem has a state of this path; if not, they are complete.
     """
 
-    legs: list[_LoadSegment]
-    begun: bool
+    segments: list[_LoadSegment]
+    has_state: bool
 
 
-_calls: weakref.WeakKeyDictionary[ContactProblem, dict[Path, _LoadProgramme]]
-_calls = weakref.WeakKeyDictionary()
+_programmes: weakref.WeakKeyDictionary[ContactProblem, dict[Path, _LoadProgramme]]
+_programmes = weakref.WeakKeyDictionary()
 
 
-def _place(
-    problem: ContactProblem, checkpoint: Path, leg: _LoadSegment
+def _locate_segment(
+    problem: ContactProblem, checkpoint: Path, segment: _LoadSegment
 ) -> tuple[_LoadProgramme, states.StoredCheckpoint | None]:
-    """Where in the load path of a file a call stands. Collective.
+    """Find the position of a call in the load path of a checkpoint file. Collective.
 
     Returns:
-        The calls, this one included; and what is to be taken up, None where there is nothing. If
-        the file has later ones, this one is done, and nothing is begun.
+        The calls, including this one, and the checkpoint to be loaded, or None. If the file has
+        later calls, this one is complete, and the result has no state.
 
     Raises:
-        ValueError: The file is of another path.
+        ValueError: The file is of another load path.
     """
-    known = _calls.setdefault(problem, {}).setdefault(
+    known = _programmes.setdefault(problem, {}).setdefault(
         checkpoint.absolute(), _LoadProgramme([], False)
     )
-    legs = known.legs
-    # A loop that was left, or an increment that failed: the same call goes on.
-    again = known.begun and not legs[-1].is_done() and leg.same(legs[-1], up_to=legs[-1].reached)
-    earlier = legs[:-1] if again else legs
-    there = (again or not known.begun) and states.exists(problem, checkpoint)
-    if not there and (known.begun or not legs):
-        return _LoadProgramme([*earlier, leg], True), None
-    stored = states.read(problem, checkpoint) if there else None
+    segments = known.segments
+    # The same call may be repeated after its loop was left, or an increment failed.
+    again = (
+        known.has_state
+        and not segments[-1].is_done()
+        and segment.is_equal(segments[-1], up_to=segments[-1].reached)
+    )
+    earlier = segments[:-1] if again else segments
+    has_file = (again or not known.has_state) and states.exists(problem, checkpoint)
+    if not has_file and (known.has_state or not segments):
+        return _LoadProgramme([*earlier, segment], True), None
+    stored = states.read(problem, checkpoint) if has_file else None
     try:
         theirs = [_LoadSegment(**each) for each in stored.notes or ()] if stored else []
     except TypeError:  # notes of a caller of `checkpoint.save`
         theirs = []
-    if again and len(theirs) <= len(earlier):  # nothing of it was saved
-        return _LoadProgramme([*earlier, leg], True), None
+    if again and len(theirs) <= len(earlier):  # nothing of this call was saved
+        return _LoadProgramme([*earlier, segment], True), None
     if len(theirs) <= len(earlier):
         raise ValueError(
             f"{checkpoint} has {len(theirs)} calls of increments(), and this is number "
             f"{len(earlier) + 1}: it was written by another program; remove it to start again"
         )
-    there_leg = theirs[len(earlier)]
-    if leg.estimate != there_leg.estimate:
+    other = theirs[len(earlier)]
+    if segment.estimate != other.estimate:
         raise ValueError(
-            f"{checkpoint} is of a history {'with' if there_leg.estimate else 'without'} estimate; "
+            f"{checkpoint} is of a history {'with' if other.estimate else 'without'} estimate; "
             "use the same argument, or remove it to start again"
         )
     is_last = len(theirs) == len(earlier) + 1
-    if not leg.same(there_leg, up_to=there_leg.reached if is_last else None):
+    if not segment.is_equal(other, up_to=other.reached if is_last else None):
         raise ValueError(
             f"{checkpoint} is of another load path: its call number {len(earlier) + 1} of "
-            f"increments() goes {there_leg}, and is done up to {there_leg.reached:g}; this one "
-            f"goes {leg}. Make the same calls in the same order (those that are done solve "
-            "nothing), or remove it to start again"
+            f"increments() goes {other}, and is complete up to {other.reached:g}; this one goes "
+            f"{segment}. Make the same calls in the same order (complete ones solve nothing), or "
+            "remove it to start again"
         )
-    leg.reached = there_leg.reached
+    segment.reached = other.reached
     if is_last:
-        return _LoadProgramme([*earlier, leg], True), stored
-    known.legs.append(leg)
-    return _LoadProgramme([*earlier, leg], False), None
+        return _LoadProgramme([*earlier, segment], True), stored
+    known.segments.append(segment)
+    return _LoadProgramme([*earlier, segment], False), None
 
 
-class _Watch:
-    """Looks for functions in the bulk form that the loop changes, and no checkpoint has."""
+class _UnsavedCoefficients:
+    """Functions in the bulk form that are not saved in the checkpoint, and must not change."""
 
     def __init__(self, problem: ContactProblem, fields: Sequence[fem.Function]) -> None:
-        kept = {id(problem.u), *(id(field) for field in fields)}
+        saved = {id(problem.u), *(id(field) for field in fields)}
         coefficients = problem.full.bulk.form.coefficients()
-        self._watched = [(f.name, Dependence([], [f])) for f in coefficients if id(f) not in kept]
+        self._unsaved = [(f.name, Dependence([], [f])) for f in coefficients if id(f) not in saved]
         self._comm = problem.u.function_space.mesh.comm
 
-    def look(self) -> None:
-        """Note the values."""
-        for _, function in self._watched:
+    def record(self) -> None:
+        """Record the present values."""
+        for _, function in self._unsaved:
             function.note()
 
-    def compare(self) -> None:
-        """Warn, once, of those that have changed since. Collective."""
-        mine = [function.changed for _, function in self._watched]
-        changed = np.any(self._comm.allgather(mine), axis=0)
-        names = [self._watched[i][0] for i in np.flatnonzero(changed)]
+    def check(self) -> None:
+        """Warn once of functions that the loop body has changed. Collective."""
+        local = [function.changed for _, function in self._unsaved]
+        changed = np.any(self._comm.allgather(local), axis=0)
+        names = [self._unsaved[i][0] for i in np.flatnonzero(changed)]
         if names:
-            self._watched = []
+            self._unsaved = []
             warn(
                 self._comm,
                 f"{', '.join(names)} in the bulk form is changed between increments, but is not "
@@ -569,52 +573,52 @@ class _Watch:
 
 @dataclasses.dataclass
 class _Progress:
-    """Where a history stands; numbers only, so that a checkpoint can hold it.
+    """State of the increment control; numbers only, because it is saved in checkpoints.
 
     Attributes:
         load: Load parameter of the last committed increment.
-        last: Size of that increment; 0 before the first.
-        largest: Largest size of the next one, infinite where none was cut.
-        cuts: How often increments have been halved and not doubled since.
-        successes: Increments since the last halving or doubling.
-        change: Norm of the change of the unknowns in the last increment; 0 if it is unknown.
-        way: Sum of these.
-        travelled: Sum of the sizes of the increments where it is known.
+        size: Size of that increment; 0 before the first.
+        max_size: Largest size of the next increment, infinite unless increments were cut.
+        cuts: Number of halvings that have not been reversed.
+        successes: Number of increments since the last halving or doubling.
+        change: Norm of the change of the unknowns in the last increment; 0 if unknown.
+        total_change: Sum of these norms.
+        total_size: Sum of the sizes of the increments with known change.
     """
 
     load: float
-    last: float = 0.0
-    largest: float = np.inf
+    size: float = 0.0
+    max_size: float = np.inf
     cuts: float = 0
     successes: float = 0
     change: float = 0.0
-    way: float = 0.0
-    travelled: float = 0.0
+    total_change: float = 0.0
+    total_size: float = 0.0
 
-    def cut(self, tried: float) -> None:
-        self.largest, self.cuts, self.successes = tried / 2, self.cuts + 1, 0
+    def cut(self, size: float) -> None:
+        self.max_size, self.cuts, self.successes = size / 2, self.cuts + 1, 0
 
     def advance(self, goal: float, problem: ContactProblem) -> None:
-        """Take note of the increment to the load parameter goal that was committed. Collective."""
-        self.last, self.load, self.change = goal - self.load, goal, 0.0
+        """Record a committed increment to the load parameter ``goal``. Collective."""
+        self.size, self.load, self.change = goal - self.load, goal, 0.0
         change = problem.state.change
         if change is not None:
             squares = global_sum(problem.u.function_space.mesh.comm, float(change @ change))
             self.change = float(np.sqrt(squares))
-            self.way += self.change
-            self.travelled += abs(self.last)
+            self.total_change += self.change
+            self.total_size += abs(self.size)
         self.successes += 1
-        if self.cuts and self.successes >= _PATIENCE:
+        if self.cuts and self.successes >= _INCREMENTS_BEFORE_DOUBLING:
             self.cuts, self.successes = self.cuts - 1, 0
-            self.largest = 2 * self.largest if self.cuts else np.inf
+            self.max_size = 2 * self.max_size if self.cuts else np.inf
 
     def limit_point(self) -> str:
-        """What to try where the load seems to have a maximum; empty where it does not."""
-        if not self.change * self.travelled > _LIMIT_POINT * self.way * abs(self.last):
+        """Return advice if the load seems to have a maximum, else an empty string."""
+        if not self.change * self.total_size > _LIMIT_RATIO * self.total_change * abs(self.size):
             return ""
-        grown = self.change * self.travelled / (self.way * abs(self.last))
+        ratio = self.change * self.total_size / (self.total_change * abs(self.size))
         return (
-            f"Displacements per load are {grown:.2g} times the mean of this history: the load may "
+            f"Displacements per load are {ratio:.2g} times the mean of this history: the load may "
             "have a maximum here (a limit point, as in snap-through or separation); prescribe a "
             "displacement instead of a force"
         )
@@ -638,14 +642,14 @@ def _setter(load: fem.Constant | Callable[[float], None]) -> Callable[[float], N
 
 
 def _ends(start: float, end: float, steps: int | Sequence[float]) -> list[float]:
-    """Ends of the increments that are asked for."""
+    """Return the load parameters at the ends of the requested increments."""
     if isinstance(steps, int | np.integer):
         if steps < 1:
             raise ValueError(f"steps is {steps}; it must be at least 1")
         with np.errstate(all="ignore"):
             ends = [start + (end - start) * (i / steps) for i in range(1, steps)] + [float(end)]
-            ways = np.diff([start, *ends])
-        if not (np.all(np.isfinite(ends)) and (np.all(ways > 0) or np.all(ways < 0))):
+            sizes = np.diff([start, *ends])
+        if not (np.all(np.isfinite(ends)) and (np.all(sizes > 0) or np.all(sizes < 0))):
             raise ValueError(
                 f"steps is {steps}; so many increments from start = {start!r} to end = {end!r} "
                 "cannot be distinguished in double precision, or overflow: take fewer, or let the "
@@ -653,17 +657,17 @@ def _ends(start: float, end: float, steps: int | Sequence[float]) -> list[float]
             )
         return ends
     try:
-        flat = np.ndim(steps) == 1
-        ends = [float(value) for value in steps] if flat else []
-    except (TypeError, ValueError):  # words, or rows of unequal length
-        flat = False
-    if not flat:
+        is_list = np.ndim(steps) == 1
+        ends = [float(value) for value in steps] if is_list else []
+    except (TypeError, ValueError):  # strings, or rows of unequal length
+        is_list = False
+    if not is_list:
         raise ValueError(
             f"steps is {steps!r}; it must be an integer, or the load parameters at the "
             "ends of the increments"
         )
-    ways = np.diff([start, *ends])
-    if not ends or ends[-1] != end or not (np.all(ways > 0) or np.all(ways < 0)):
+    sizes = np.diff([start, *ends])
+    if not ends or ends[-1] != end or not (np.all(sizes > 0) or np.all(sizes < 0)):
         raise ValueError(
             f"steps is {ends}; it must be an integer, or the ends of the increments, monotonic "
             f"from start = {start:g} to end = {end:g}"
