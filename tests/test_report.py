@@ -86,7 +86,7 @@ class Page(HTMLParser):
         plane = problem.u.function_space.mesh.geometry.dim == 2
         # Deformed body, history of each contact and of all; of each contact (the same captions).
         assert len(self.pictures) == 2 + len(problem.contacts) + (2 if plane else 5)
-        assert "the state holds" in self.text and "not hold" not in self.text
+        assert "verification passed" in self.text and "verification failed" not in self.text
         small = any(not contact.finite for contact in problem.contacts)
         assert ("that displacements are small" in self.text) == small
         assert {"Verdict: holds", "Problem", "Versions"} <= self.tables.keys()
@@ -178,7 +178,7 @@ def test_a_resumed_history(tmp_path, curves):
         assert close(y, [step.contacts[name].moment[0] for step in steps], 1e-14)
         x, y = drawn(curves, ("area [m²/m]", "stick"), n)
         assert close(y, [step.contacts[name].extents["stick"].area for step in steps], 1e-14)
-    x, y = drawn(curves, ("sum so far [kN m/m]", "dissipation by friction"))
+    x, y = drawn(curves, ("energy [kN m/m]", "dissipation by friction"))
     assert close(y, np.cumsum([step.energy.dissipation for step in steps]), 1e-14)
     # At the points: what `gather` has, of those near the contact.
     points = made.problem.contacts[0].gather()
@@ -256,8 +256,8 @@ def test_an_unloaded_body(tmp_path):
     assert "stick" not in steps[-1].summary() and "stick" in steps[0].summary()
     assert steps[-1].verdict.relative_residual == 0.0
     page = Page(fc.report(problem, steps, folder, csv=folder / "h.csv"))
-    assert "There are no forces." in page.text and "of the forces." not in page.text
-    assert "There is no contact force" in page.text and "e+" not in " ".join(page.pictures)
+    assert "All forces are zero." in page.text and "of the forces." not in page.text
+    assert "The contact force is zero" in page.text and "e+" not in " ".join(page.pictures)
     rows = (folder / "h.csv").read_text().splitlines()
     residuals = [row["residual (share of the forces)"] for row in csv.DictReader(rows)]
     assert residuals[-1] == "" and all(0 <= float(r) < 1e-9 for r in residuals[:-1])

@@ -331,7 +331,7 @@ def _solve(
         _programmes[problem][checkpoint.absolute()] = programme
     monitor = _UnsavedCoefficients(problem, fields) if checkpoint is not None else None
     if table is not None:
-        table.begin()
+        table.truncate()
 
     def write() -> None:
         segment.reached = progress.load

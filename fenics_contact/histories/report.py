@@ -1,4 +1,4 @@
-"""Report of a load history and its last state as one HTML page, for screen and print."""
+"""Report of a load history and its last state as one HTML page."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from fenics_contact.types import Array
 
 __all__ = ["report"]
 
-# Of the mesh's size, how far displacements are drawn at least; where they are less than the
-# round-off of coordinates there is nothing to be seen.
-_VISIBLE, _ROUND_OFF = 0.05, float(np.finfo(float).eps)
-# What legends call the energies.
+# Relative to the mesh size: largest displacement in magnified drawings, at least, and round-off of
+# coordinates.
+_MIN_DRAWN_RATIO, _ROUND_OFF_RATIO = 0.05, float(np.finfo(float).eps)
+# Labels of the energies in legends.
 _ENERGIES = {
     "work": "work of loads and motions",
     "elastic": "elastic energy",
@@ -43,10 +43,10 @@ _ENERGIES = {
     "remainder": "remainder",
 }
 _REMAINDER = (
-    "The work of an increment is that of the mean of the forces at its two ends. The remainder is "
-    "the part of it that is in none of the other sums: contact that changes within an increment, "
-    "and springs that are released where contact opens. It decreases with the increment size; if "
-    "it is large compared with the work, the increments are too large for accurate energies."
+    "The work of an increment is computed with the mean of the forces at its two ends. Contact that "
+    "changes within an increment, and contact springs that are released at opening, leave a "
+    "remainder. It decreases with the increment size; if it is large compared with the work, the "
+    "increments are too large for accurate energies."
 )
 _STYLE = """
 body { font: 15px/1.5 sans-serif; color: #1a1a1a; max-width: 72rem; margin: 2rem auto;
@@ -132,25 +132,25 @@ def report(
         scratch = Path()
         with collective_errors(comm):
             if comm.rank == 0:
-                drawing.pyplot()  # whether it is there
+                drawing.pyplot()  # raises an error without matplotlib
                 files.make_folder(path.parent)
                 scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-                rows = _rows(problem, steps, csv)
+                rows = _collect_rows(problem, steps, csv)
         problem.complete()
         problem.displacement.follow()
         page = _Page(scratch, units, view, per_thickness=table.is_per_thickness(problem))
         if magnification is None:
-            magnification = _visible(problem)
-        _state(page, problem, steps[-1], shape, magnification)
+            magnification = _choose_magnification(problem)
+        _add_state(page, problem, steps[-1], shape, magnification)
         for contact in problem.contacts:
-            _contact(page, contact, steps[-1], magnification)
+            _add_contact(page, contact, steps[-1], magnification)
         with collective_errors(comm):
             if comm.rank == 0:
-                _history(page, problem, rows)
-        _errors(page, budget)
-        _choices(page, problem, steps[-1])
-        words = information(comm).items()
-        page.words("Versions", ("what", "version"), words)
+                _add_history(page, problem, rows)
+        _add_errors(page, budget)
+        _add_settings(page, problem, steps[-1])
+        versions = information(comm).items()
+        page.add_table("Versions", ("component", "version"), versions)
         with collective_errors(comm):
             if comm.rank == 0:
                 with files.atomic_write(path) as temporary:
@@ -168,11 +168,7 @@ def _check(
     units: Any,
     magnification: Any,
 ) -> None:
-    """Refuse arguments without sense, on every rank alike.
-
-    Raises:
-        ValueError: It says what was given, and what is expected.
-    """
+    """Raise ValueError for invalid arguments, on all ranks."""
     if not isinstance(steps, Sequence) or not all(isinstance(step, Step) for step in steps):
         raise ValueError(
             f"steps is a {type(steps).__name__}; it must be a Step, or a list of them, such as "
@@ -185,7 +181,7 @@ def _check(
         )
     names = [contact.name for contact in problem.contacts]
     numbers = [step.increment for step in steps]
-    now = (problem.increment, problem.increment + 1)  # committed, or solved alone
+    now = (problem.increment, problem.increment + 1)  # committed, or only solved
     if (
         list(steps[-1].contacts) != names
         or numbers[-1] not in now
@@ -198,8 +194,8 @@ def _check(
         )
     for name, value in (("folder", folder), ("csv", csv)):
         if not (isinstance(value, str | os.PathLike) or (name == "csv" and value is None)):
-            what = {"folder": "folder", "csv": "file"}[name]
-            raise ValueError(f"{name} is {value!r}; it must be the name of a {what}")
+            kind = {"folder": "folder", "csv": "file"}[name]
+            raise ValueError(f"{name} is {value!r}; it must be the name of a {kind}")
     if budget is not None:
         check_instance("budget", budget, ErrorBudget)
     check_instance("title", title, str)
@@ -216,11 +212,11 @@ def _check(
 
 
 class _Page:
-    """Parts of the page one after another. What a rank but the first adds is dropped.
+    """The HTML page, in parts. Only the page of the first rank is written.
 
     Attributes:
         length, force, stress: Units.
-        view: Where to look from in space.
+        view: Elevation and azimuth of the camera, in space.
         per_thickness: Whether there are integrals per unit thickness.
     """
 
@@ -238,43 +234,43 @@ class _Page:
         self._pictures = 0
 
     def add(self, *parts: str) -> None:
-        """HTML as it is."""
+        """Append HTML."""
         self._parts += parts
 
-    def heading(self, text: str, level: int = 2) -> None:
-        """A heading, escaped."""
+    def add_heading(self, text: str, level: int = 2) -> None:
+        """Append a heading, escaped."""
         self.add(f"<h{level}>{escape(text)}</h{level}>")
 
-    def per(self, per_thickness: bool) -> str:
-        """What the unit of an integral ends with."""
+    def unit_suffix(self, per_thickness: bool) -> str:
+        """Return the suffix of the unit of an integral."""
         return f"/{self.length}" if per_thickness else ""
 
-    def words(self, title: str, header: Sequence[str], rows: Iterable[tuple[str, ...]]) -> None:
-        """A table of words."""
+    def add_table(self, title: str, header: Sequence[str], rows: Iterable[tuple[str, ...]]) -> None:
+        """Append a table of texts."""
         self.add('<div class="words">', html_table(title, header, rows), "</div>")
 
-    def path(self) -> Path:
-        """Where the next picture is to be drawn."""
+    def next_path(self) -> Path:
+        """Return the file of the next picture."""
         self._pictures += 1
         return self._scratch / f"{self._pictures}.png"
 
     def picture(self, path: Path, caption: str) -> str:
-        """A picture that was drawn there, within the page."""
-        if not path.exists():  # on the other ranks
+        """Return HTML with the embedded picture; "" without a file (on the other ranks)."""
+        if not path.exists():
             return ""
         data = base64.b64encode(path.read_bytes()).decode()
-        told = escape(caption)
+        text = escape(caption)
         return (
-            f'<figure><img alt="{told}" src="data:image/png;base64,{data}">'
-            f"<figcaption>{told}</figcaption></figure>"
+            f'<figure><img alt="{text}" src="data:image/png;base64,{data}">'
+            f"<figcaption>{text}</figcaption></figure>"
         )
 
-    def pictures(self, *figures: str) -> None:
-        """Beside each other, where there is room."""
+    def add_pictures(self, *figures: str) -> None:
+        """Append pictures side by side, if the page is wide enough."""
         self.add('<div class="pictures">', *figures, "</div>")
 
     def text(self, title: str) -> str:
-        """All of it."""
+        """Return the whole page."""
         head = (
             f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}'
             '</title><meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -284,20 +280,21 @@ class _Page:
         units = f"Lengths in {self.length}, forces in {self.force}, stresses in {self.stress}."
         if self.per_thickness:
             units += f" Forces, moments, areas and energies are per {self.length} of thickness."
-        foot = f"<p>{escape(units)} Written {now}.</p></body></html>"
-        return "\n".join([head, *self._parts, foot, ""])
+        footer = f"<p>{escape(units)} Written {now}.</p></body></html>"
+        return "\n".join([head, *self._parts, footer, ""])
 
 
-def _rows(
+def _collect_rows(
     problem: ContactProblem, steps: Sequence[Step], csv: str | os.PathLike[str] | None
 ) -> list[dict[str, str]]:
-    """Those of the table, or of the steps. On the first rank."""
+    """Return the rows of the table, or of the steps. On the first rank."""
     if csv is None:
         names = table.columns(problem)
         return [
-            dict(zip(names, map(str, table.values(problem, step)), strict=True)) for step in steps
+            dict(zip(names, map(str, table.row_values(problem, step)), strict=True))
+            for step in steps
         ]
-    rows = table.read(Path(csv), problem)
+    rows = table.read_rows(Path(csv), problem)
     if int(rows[-1]["increment"]) != steps[-1].increment:
         raise ValueError(
             f"csv is {csv}, whose last increment is {rows[-1]['increment']}, but the last "
@@ -306,68 +303,68 @@ def _rows(
     return rows
 
 
-def _visible(problem: ContactProblem) -> float:
-    """A magnification, 1, 2 or 5 by a power of ten, with which displacements show. Collective."""
+def _choose_magnification(problem: ContactProblem) -> float:
+    """Return a factor 1, 2 or 5 times 10ⁿ that makes displacements visible. Collective."""
     u, comm = problem.displacement.u, problem.u.function_space.mesh.comm
     largest = global_max(comm, np.abs(u.x.array))
     size = problem.full.scales.mesh_size
-    if any(contact.finite for contact in problem.contacts) or not largest > _ROUND_OFF * size:
+    if any(contact.finite for contact in problem.contacts) or not largest > _ROUND_OFF_RATIO * size:
         return 1.0
-    wanted = _VISIBLE * size / largest
-    power = 10.0 ** np.floor(np.log10(wanted))
-    return float(max(1.0, power * max(n for n in (1, 2, 5) if n * power <= wanted)))
+    upper_bound = _MIN_DRAWN_RATIO * size / largest
+    power = 10.0 ** np.floor(np.log10(upper_bound))
+    return float(max(1.0, power * max(n for n in (1, 2, 5) if n * power <= upper_bound)))
 
 
-def _state(
+def _add_state(
     page: _Page, problem: ContactProblem, step: Step, shape: drawing.ShapeOf, magnification: float
 ) -> None:
-    """Verdict in words, resultants, the deformed body. Collective."""
+    """Add the verdict in words, resultants and the deformed body. Collective."""
     failures = step.verdict.failures
     where = f"Increment {step.increment}" + (
         "" if step.load is None else f", at load {step.load:.6g}"
     )
     if failures:
-        page.add(f'<p class="fails">{escape(where)}: the state does not hold.</p>')
+        page.add(f'<p class="fails">{escape(where)}: the verification failed.</p>')
     else:
         checked = ["equilibrium", "the balance of forces and moments"]
         checked += ["the contact laws at every point"] if step.verdict.laws else []
         checked += ["the penetration left by multipliers"] if step.verdict.enforcement else []
         checked += ["the rigid obstacles"] if step.verdict.obstacles else []
-        small = [c.name for c in problem.contacts if not c.finite]
+        small = [c.name for c in problem.contacts if not c.finite]  # small displacements
         known = step.verdict.small_displacement_error
         checked += ["that displacements are small"] if any(n in known for n in small) else []
         residual = f"The residual is {step.verdict.relative_residual:.1e} of the forces."
         if not step.verdict.is_loaded:
-            residual = "There are no forces."
+            residual = "All forces are zero."
         page.add(
-            f'<p class="holds">{escape(where)}: the state holds. Verified independently of the '
-            f"solver: {', '.join(checked)}. {residual}</p>"
+            f'<p class="holds">{escape(where)}: the verification passed. Evaluated independently '
+            f"of the solver: {', '.join(checked)}. {residual}</p>"
         )
     page.add(step._repr_html_())
-    page.heading("Deformed body")
-    path = page.path()
-    drawn = shape()
+    page.add_heading("Deformed body")
+    path = page.next_path()
+    body = shape()
     with collective_errors(problem.u.function_space.mesh.comm):
-        if drawn is not None:
+        if body is not None:
             units = page.length, page.stress
             obstacles = shapes_of(problem.contacts)
-            figure = drawing.deformed(drawn, units, "", magnification, obstacles, page.view)
+            figure = drawing.deformed(body, units, "", magnification, obstacles, page.view)
             drawing.save(figure, path)
-    told = "" if magnification == 1 else f", displacements × {magnification:g}"
-    page.pictures(page.picture(path, f"Original and deformed mesh{told}"))
+    scale = "" if magnification == 1 else f", displacements × {magnification:g}"
+    page.add_pictures(page.picture(path, f"Original and deformed mesh{scale}"))
 
 
-def _contact(page: _Page, contact: Contact, step: Step, magnification: float) -> None:
-    """Tractions, gap, slip, status and extents. Collective."""
-    page.heading(f"Contact: {contact.name}")
+def _add_contact(page: _Page, contact: Contact, step: Step, magnification: float) -> None:
+    """Add tractions, gap, slip, status and extents of a contact. Collective."""
+    page.add_heading(f"Contact: {contact.name}")
     if not step.verdict.equations[contact.name].is_loaded:
-        page.add("<p>There is no contact force; tractions other than zero are round-off.</p>")
+        page.add("<p>The contact force is zero; tractions other than zero are round-off.</p>")
     units = {"length": page.length, "stress": page.stress}
-    drawn = []
+    pictures = []
     if contact.points.shape[1] == 2:
-        path = page.path()
+        path = page.next_path()
         plotting.plot_along(path, contact, **units)
-        drawn.append(page.picture(path, "Pressure, friction, gap and slip at the points"))
+        pictures.append(page.picture(path, "Pressure, friction, gap and slip at quadrature points"))
     else:
         for field, caption in (
             ("pressure", "Pressure"),
@@ -375,23 +372,23 @@ def _contact(page: _Page, contact: Contact, step: Step, magnification: float) ->
             ("gap", "Gap"),
             ("slip", "Slip"),
         ):
-            path = page.path()
-            shown_as = {"magnification": magnification, "view": page.view}
-            plotting.plot_field(path, contact, field, **units, **shown_as)  # type: ignore[arg-type]
-            drawn.append(page.picture(path, f"{caption}, means of the facets"))
-    path = page.path()
+            path = page.next_path()
+            options = {"magnification": magnification, "view": page.view}
+            plotting.plot_field(path, contact, field, **units, **options)  # type: ignore[arg-type]
+            pictures.append(page.picture(path, f"{caption}, mean value per facet"))
+    path = page.next_path()
     plotting.plot_status(
         path, contact, length=page.length, magnification=magnification, view=page.view
     )
-    drawn.append(page.picture(path, "Status of most points of each facet"))
-    page.pictures(*drawn)
+    pictures.append(page.picture(path, "Status of most points of each facet"))
+    page.add_pictures(*pictures)
     extents = step.contacts[contact.name].extents
     rows = [
         (
             state,
             f"{extents[state].area:.6g}",
-            _place(extents[state].low),
-            _place(extents[state].high),
+            _format_point(extents[state].low),
+            _format_point(extents[state].high),
         )
         for state in table.STATES
     ]
@@ -400,48 +397,48 @@ def _contact(page: _Page, contact: Contact, step: Step, magnification: float) ->
     page.add(html_table("Extents on the undeformed surface", header, rows))
 
 
-def _place(x: Array) -> str:
+def _format_point(x: Array) -> str:
     return "–" if np.isnan(x).any() else "(" + ", ".join(f"{value:.6g}" for value in x) + ")"
 
 
-def _history(page: _Page, problem: ContactProblem, rows: list[dict[str, str]]) -> None:
-    """Curves over the load, or where it is not known over the increments. On the first rank."""
-    page.heading("History")
+def _add_history(page: _Page, problem: ContactProblem, rows: list[dict[str, str]]) -> None:
+    """Add curves over the load, or over the increments without a load. On the first rank."""
+    page.add_heading("History")
     first, last = rows[0]["increment"], rows[-1]["increment"]
-    page.add(f"<p>Increments {first} to {last}, {_total(rows, 'iterations'):.0f} iterations, ")
-    page.add(f"{_total(rows, 'cuts'):.0f} cuts.</p>")
+    page.add(f"<p>Increments {first} to {last}, {_sum_column(rows, 'iterations'):.0f} iterations, ")
+    page.add(f"{_sum_column(rows, 'cuts'):.0f} cuts.</p>")
     increments = _column(rows, "increment")
-    over, abscissa = _column(rows, "load"), "load"
-    if np.isnan(over).any():
-        over, abscissa = increments, "increment"
-    drawn = []
+    x, abscissa = _column(rows, "load"), "load"
+    if np.isnan(x).any():
+        x, abscissa = increments, "increment"
+    pictures = []
     for contact in problem.contacts:
-        path, d = page.path(), contact.surface.mesh.geometry.dim
+        path, d = page.next_path(), contact.surface.mesh.geometry.dim
         with plotting.figure(path, columns=3, size=(4.6, 3.6)) as (forces, moments, areas):
             for axis in table.AXES[:d]:
                 values = _column(rows, table.column(contact, f"force {axis}", "force"))
-                forces.plot(over, values, ".-", label=f"force {axis}")
+                forces.plot(x, values, ".-", label=f"force {axis}")
             name = table.column(contact, "friction as the sum of sizes", "force")
-            forces.plot(over, _column(rows, name), "k:", label="friction ∫|τ|")
+            forces.plot(x, _column(rows, name), "k:", label="friction ∫|τ|")
             for axis in table.AXES if d == 3 else "z":
                 name = table.column(contact, f"moment {axis} about the origin", "force length")
-                moments.plot(over, _column(rows, name), ".-", label=f"moment {axis}")
+                moments.plot(x, _column(rows, name), ".-", label=f"moment {axis}")
             for state in table.STATES:
                 values = _column(rows, table.column(contact, f"area in {state}", "area"))
-                areas.plot(over, values, ".-", label=state)
-            per = page.per(contact.inputs.per_thickness)
-            forces.set(ylabel=f"force on the body [{page.force}{per}]")
-            moments.set(ylabel=f"moment about the origin [{page.force} {page.length}{per}]")
-            areas.set(ylabel=f"area [{page.length}²{per}]")
+                areas.plot(x, values, ".-", label=state)
+            suffix = page.unit_suffix(contact.inputs.per_thickness)
+            forces.set(ylabel=f"force on the body [{page.force}{suffix}]")
+            moments.set(ylabel=f"moment about the origin [{page.force} {page.length}{suffix}]")
+            areas.set(ylabel=f"area [{page.length}²{suffix}]")
             for axes in (forces, moments, areas):
                 axes.set(xlabel=abscissa)
                 axes.locator_params(axis="x", nbins=6)
                 axes.ticklabel_format(scilimits=(-3, 4))
                 axes.grid(alpha=0.25)
                 axes.legend(fontsize="small")
-        drawn.append(page.picture(path, f"{contact.name}: forces, moments and areas"))
-    page.add(*drawn)  # each as wide as the page
-    path = page.path()
+        pictures.append(page.picture(path, f"{contact.name}: forces, moments and areas"))
+    page.add(*pictures)  # each as wide as the page
+    path = page.next_path()
     with plotting.figure(path, columns=2, size=(6.4, 3.6)) as (solver, energy):
         solver.bar(increments, _column(rows, "iterations"), color=drawing.COLOURS["pressure"])
         cuts = _column(rows, "cuts")
@@ -451,39 +448,39 @@ def _history(page: _Page, problem: ContactProblem, rows: list[dict[str, str]]) -
         for name in table.ENERGIES:
             sums = np.cumsum(_column(rows, table.energy_column(problem, name)))
             energy.plot(increments, sums, ".-", label=_ENERGIES[name])
-        per = page.per(page.per_thickness)
-        energy.set(xlabel="increment", ylabel=f"sum so far [{page.force} {page.length}{per}]")
+        suffix = page.unit_suffix(page.per_thickness)
+        energy.set(xlabel="increment", ylabel=f"energy [{page.force} {page.length}{suffix}]")
         energy.legend(fontsize="small")
         for axes in (solver, energy):
             axes.grid(alpha=0.25)
             axes.locator_params(axis="x", integer=True)
-    page.add(page.picture(path, "Iterations of the increments; work, and what became of it"))
+    page.add(page.picture(path, "Iterations of the increments; cumulative work and energies"))
     page.add(f"<p>{escape(_REMAINDER)}</p>")
 
 
 def _column(rows: list[dict[str, str]], name: str) -> Array:
-    """Numbers; NaN where there is none."""
+    """Return the numbers of a column; NaN for missing values."""
     return np.array([float(row[name] or "nan") for row in rows])
 
 
-def _total(rows: list[dict[str, str]], name: str) -> float:
+def _sum_column(rows: list[dict[str, str]], name: str) -> float:
     return float(_column(rows, name).sum())
 
 
-def _errors(page: _Page, budget: ErrorBudget | None) -> None:
-    """The budget, where there is one."""
-    page.heading("Errors")
+def _add_errors(page: _Page, budget: ErrorBudget | None) -> None:
+    """Add the error budget, if it is given."""
+    page.add_heading("Errors")
     if budget is None:
         page.add("<p>Not estimated: give report(..., budget=estimate_errors(problem, stress)).</p>")
     else:
         page.add(budget._repr_html_())
 
 
-def _choices(page: _Page, problem: ContactProblem, step: Step) -> None:
-    """Verdict in numbers, what was tried, and what was chosen. Collective."""
-    page.heading("Checks")
+def _add_settings(page: _Page, problem: ContactProblem, step: Step) -> None:
+    """Add the verdict in numbers, the attempts and the numerical settings. Collective."""
+    page.add_heading("Verification")
     page.add(step.verdict._repr_html_())
-    page.heading("What was chosen")
+    page.add_heading("Settings")
     space = problem.u.function_space
     mesh = space.mesh
     kind = mesh.topology.cell_name()
@@ -492,44 +489,44 @@ def _choices(page: _Page, problem: ContactProblem, step: Step) -> None:
         ("unknowns", str(space.dofmap.index_map.size_global * space.dofmap.index_map_bs)),
         ("ranks", str(mesh.comm.size)),
         ("method of the last increment", step.method),
-        ("attempts in it", "; ".join(map(str, step.attempts))),
+        ("attempts of the last increment", "; ".join(map(str, step.attempts))),
         ("accuracy", "not given" if problem.accuracy is None else str(problem.accuracy)),
     ]
     if not all(contact.finite for contact in problem.contacts):
         rows.append(
             (
-                "largest change of force or pressure by small displacements",
+                "tolerance of the small-displacement error",
                 f"{problem.small_displacement_tolerance:g}",
             )
         )
-    page.words("Problem", ("what", "choice"), rows)
+    page.add_table("Problem", ("setting", "value"), rows)
     for contact in problem.contacts:
-        count = contact.surface.submesh.topology
-        facets = count.index_map(count.dim).size_global
+        topology = contact.surface.submesh.topology
+        n_facets = topology.index_map(topology.dim).size_global
         rows = [
             ("law", type(contact.law).__name__),
             ("obstacle", type(contact.obstacle).__name__),
             ("kinematics", contact.kinematics),
-            ("enforcement", _enforcement(contact)),
-            ("facets", str(facets)),
+            ("enforcement", _describe_enforcement(contact)),
+            ("facets", str(n_facets)),
         ]
         given = contact.law.parameters()
         for name in {**given, **contact.parameters}:
-            rows.append((name, _parameter(given.get(name), contact.parameters.get(name))))
-        page.words(f"Contact: {contact.name}", ("what", "choice"), rows)
+            rows.append((name, _describe_parameter(given.get(name), contact.parameters.get(name))))
+        page.add_table(f"Contact: {contact.name}", ("setting", "value"), rows)
 
 
-def _enforcement(contact: Contact) -> str:
+def _describe_enforcement(contact: Contact) -> str:
     if contact.multipliers is None:
         return "penalty"
-    return f"augmented, to {contact.tolerance:g} of the largest traction"
+    return f"augmented, tolerance {contact.tolerance:g} of the largest traction"
 
 
-def _parameter(given: Any, constant: fem.Constant | None) -> str:
-    """Of a law or obstacle: how it was given, and its number as it is now, if it has one."""
+def _describe_parameter(given: Any, constant: fem.Constant | None) -> str:
+    """Describe a parameter of a law or obstacle, and its present value if it is a number."""
     if isinstance(given, NodalSprings):
-        return f"{given.k:g} for each node"
+        return f"{given.k:g} per node"
     if constant is None:
-        return "given by an expression"
+        return "expression"
     number = ", ".join(f"{x:g}" for x in np.ravel(constant.value))
     return f"{number} E/h" if isinstance(given, RelativeStiffness) else number

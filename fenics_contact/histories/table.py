@@ -1,4 +1,4 @@
-"""A history as a table in a file: one row an increment, for spreadsheets and plots."""
+"""Tables of load histories (CSV): one row per increment."""
 
 from __future__ import annotations
 
@@ -26,33 +26,34 @@ __all__ = [
     "columns",
     "energy_column",
     "is_per_thickness",
-    "read",
-    "values",
+    "read_rows",
+    "row_values",
 ]
 
 AXES = "xyz"
 STATES = ("contact", "stick", "slip")
 ENERGIES = ("work", "elastic", "springs", "dissipation", "remainder")
-# How every table begins: a file that begins otherwise is not overwritten.
-_FIRST = ("increment", "load")
-_BEGINS = ",".join(_FIRST)
+# First columns of every table; a file that begins with other text is not overwritten.
+_FIRST_COLUMNS = ("increment", "load")
+_HEADER_START = ",".join(_FIRST_COLUMNS)
 _PER_THICKNESS = " per thickness"
 
 
 class Table:
     """A file of comma-separated values (CSV), written by the first rank.
 
-    A row is there as soon as its increment is committed. In the plane forces, moments, areas and
-    energies are per unit thickness, and the header says so, unless the contacts' weight has it.
+    A row is written when its increment is committed. In the plane forces, moments, areas and
+    energies are per unit thickness, and the header states it, unless the contacts have a weight.
     The constructor is collective.
 
     Args:
-        errors: Quantities whose errors the steps will have.
+        path: The file.
+        problem: The problem.
+        errors: Quantities with error estimates in the steps.
 
     Raises:
-        ValueError: Its folder is not there, or there is a file that is no such table. On all
-            ranks.
-        OSError: It cannot be written. On all ranks.
+        ValueError: The folder does not exist, or the file is no table; raised on all ranks.
+        OSError: The file cannot be written; raised on all ranks.
     """
 
     def __init__(self, path: Path, problem: ContactProblem, errors: Sequence[str] = ()) -> None:
@@ -68,36 +69,36 @@ class Table:
     def _check(self) -> None:
         files.check_file(self._path)
         files.check_folder("csv", self._path)
-        there = self._path.exists()
+        exists = self._path.exists()
         with open(self._path, "a+", newline="", encoding="utf-8") as file:
             file.seek(0)
             try:
-                first = file.read(len(_BEGINS))  # whatever else it is may have no lines
+                start = file.read(len(_HEADER_START))
             except UnicodeDecodeError:
-                first = "no text"
-        if not there:
+                start = "no text"
+        if not exists:
             self._path.unlink()
-        if first and first != _BEGINS:
+        if start and start != _HEADER_START:
             raise ValueError(
                 f"csv is {self._path}, an existing file that is no table of increments and would "
                 "be overwritten: give another name, or remove it"
             )
 
-    def begin(self) -> None:
-        """Keep the rows of the increments that the problem has committed. Collective.
+    def truncate(self) -> None:
+        """Discard the rows after the last committed increment. Collective.
 
         Raises:
-            ValueError: They have other columns, or are damaged. On all ranks.
-            OSError: The file cannot be written; it is as before. On all ranks.
+            ValueError: The rows have other columns, or are damaged; raised on all ranks.
+            OSError: The file cannot be written and is unchanged; raised on all ranks.
         """
         with collective_errors(self._comm):
             if self._comm.rank == 0:
-                kept = self._rows() if self._problem.increment else []
+                lines = self._committed_lines() if self._problem.increment else []
                 with files.atomic_write(self._path) as path:
-                    path.write_bytes("".join([self._header, *kept]).encode())
+                    path.write_bytes("".join([self._header, *lines]).encode())
 
-    def _rows(self) -> list[str]:
-        """Lines of the file up to the committed increment."""
+    def _committed_lines(self) -> list[str]:
+        """Return the lines of the file up to the last committed increment."""
         if not self._path.exists():
             return []
         header, *lines = self._path.read_bytes().decode().splitlines(keepends=True) or [""]
@@ -107,86 +108,83 @@ class Table:
                 "columns differ; give another name, or remove it"
             )
         if lines and not lines[-1].endswith("\n"):
-            lines.pop()  # what ended the run ended it in the middle
-        kept, n = [], len(next(csv.reader([self._header])))
+            lines.pop()  # incomplete, because the run was interrupted
+        committed, n = [], len(next(csv.reader([self._header])))
         for number, line in enumerate(lines, start=2):
             row = next(csv.reader([line]))
             if len(row) != n or not row[0].isdigit():
                 raise ValueError(f"{self._path} is damaged in line {number}; remove it")
             if int(row[0]) <= self._problem.increment:
-                kept.append(line)
-        return kept
+                committed.append(line)
+        return committed
 
     def add(self, step: Step) -> None:
         """Append the row of a committed increment. Collective.
 
         Raises:
-            OSError: It cannot be written; the file is as before. On all ranks.
+            OSError: The file cannot be written and is unchanged; raised on all ranks.
         """
-        row = values(self._problem, step)
-        found = step.increment_error or {}
-        row += [found.get(name, "") for name in self._errors]
+        row = row_values(self._problem, step)
+        errors = step.increment_error or {}
+        row += [errors.get(name, "") for name in self._errors]
         with collective_errors(self._comm):
             if self._comm.rank == 0:
                 self._append(_line(row).encode())
 
     def _append(self, line: bytes) -> None:
-        before = self._path.stat().st_size
+        size = self._path.stat().st_size
         try:
             with open(self._path, "ab") as file:
                 file.write(line)
                 file.flush()
                 os.fsync(file.fileno())
         except OSError:
-            os.truncate(self._path, before)
+            os.truncate(self._path, size)
             raise
 
 
 def columns(problem: ContactProblem) -> list[str]:
-    """Names and units of what a row has of every step."""
-    names = [*_FIRST]
+    """Return names and units of the columns, without those of errors."""
+    names = [*_FIRST_COLUMNS]
     for contact in problem.contacts:
-        names += [column(contact, *each) for each in _columns(contact)]
+        names += [column(contact, *each) for each in _contact_columns(contact)]
     names += [energy_column(problem, name) for name in ENERGIES]
     return [*names, "residual (share of the forces)", "method", "iterations", "cuts"]
 
 
 def is_per_thickness(problem: ContactProblem) -> bool:
-    """Whether energies are per unit thickness, see `Inputs.per_thickness`."""
+    """Return whether energies are per unit thickness (`Inputs.per_thickness` of any contact)."""
     return any(contact.inputs.per_thickness for contact in problem.contacts)
 
 
 def energy_column(problem: ContactProblem, name: str) -> str:
-    """Name and unit of the column of one of `ENERGIES`."""
+    """Return name and unit of the column of one of `ENERGIES`."""
     return f"{name} (force length{_PER_THICKNESS if is_per_thickness(problem) else ''})"
 
 
 def column(contact: Contact, name: str, unit: str) -> str:
-    """Name and unit of a column of a contact.
-
-    "force", "force length" and "area" may be per unit thickness.
-    """
+    """Return name and unit of a column of a contact; integrals may be per unit thickness."""
     integral = unit in ("force", "force length", "area") and contact.inputs.per_thickness
     return f"{contact.name}: {name} ({unit}{_PER_THICKNESS if integral else ''})"
 
 
-def values(problem: ContactProblem, step: Step) -> list[object]:
-    """What a row has of a step; empty where there is no number."""
+def row_values(problem: ContactProblem, step: Step) -> list[object]:
+    """Return the values of a row, without errors; "" for missing values."""
     row: list[object] = [step.increment, "" if step.load is None else step.load]
     for contact in problem.contacts:
-        row += _values(step.contacts[contact.name])
+        row += _contact_values(step.contacts[contact.name])
     row += [getattr(step.energy, name) for name in ENERGIES]
     row.append(step.verdict.relative_residual if step.verdict.is_loaded else "")
     row += [step.method, step.iterations]
     return [*row, sum(attempt.method == "cut" for attempt in step.attempts)]
 
 
-def read(path: Path, problem: ContactProblem) -> list[dict[str, str]]:
-    """The rows of a table by column. On the calling rank only.
+def read_rows(path: Path, problem: ContactProblem) -> list[dict[str, str]]:
+    """Read the rows of a table, by column. On the calling rank only.
 
     Raises:
-        ValueError: It is no table of a history of these contacts.
-        OSError: It cannot be read.
+        ValueError: The file is no table of a history of these contacts.
+        OSError: The file cannot be read.
     """
     try:
         with open(path, newline="", encoding="utf-8") as file:
@@ -200,19 +198,19 @@ def read(path: Path, problem: ContactProblem) -> list[dict[str, str]]:
             f"is no column {missing[0]!r}; give the file written by increments(csv=...)"
         )
     if None in rows[-1].values():
-        rows.pop()  # what ended the run ended it in the middle
+        rows.pop()  # incomplete, because the run was interrupted
     return rows
 
 
-def _columns(contact: Contact) -> list[tuple[str, str]]:
-    """Names and units of what a contact has in a row."""
+def _contact_columns(contact: Contact) -> list[tuple[str, str]]:
+    """Return names and units of the columns of a contact."""
     d = contact.surface.mesh.geometry.dim
-    turns = AXES if d == 3 else "z"
+    moment_axes = AXES if d == 3 else "z"
     return [
         *((f"force {axis}", "force") for axis in AXES[:d]),
         ("normal force", "force"),
         ("friction as the sum of sizes", "force"),
-        *((f"moment {axis} about the origin", "force length") for axis in turns),
+        *((f"moment {axis} about the origin", "force length") for axis in moment_axes),
         *((f"area in {state}", "area") for state in STATES),
         *(
             (f"{state} {end} {axis}", "length")
@@ -226,8 +224,8 @@ def _columns(contact: Contact) -> list[tuple[str, str]]:
     ]
 
 
-def _values(r: Resultants) -> list[object]:
-    """The same in numbers; empty where no point is of a state."""
+def _contact_values(r: Resultants) -> list[object]:
+    """Return the values of the columns of a contact; "" for extents without points."""
     extents = [r.extents[state] for state in STATES]
     ends = np.concatenate([end for e in extents for end in (e.low, e.high)])
     return [
@@ -241,7 +239,7 @@ def _values(r: Resultants) -> list[object]:
 
 
 def _unit(quantity: str) -> str:
-    """Of a quantity of an `ErrorBudget`."""
+    """Return the unit of a quantity of an `ErrorBudget`."""
     kind = quantity.rsplit(" ", 1)[-1]
     return {"force": "force", "pressure": "stress", "displacement": "length"}[kind]
 
