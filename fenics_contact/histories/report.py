@@ -31,9 +31,8 @@ from fenics_contact.types import Array
 
 __all__ = ["report"]
 
-# Relative to the mesh size: largest displacement in magnified drawings, at least, and round-off of
-# coordinates.
-_MIN_DRAWN_RATIO, _ROUND_OFF_RATIO = 0.05, float(np.finfo(float).eps)
+# Largest displacement after magnification, and round-off of coordinates, relative to the mesh size.
+_MAGNIFIED_RATIO, _ROUND_OFF_RATIO = 0.05, float(np.finfo(float).eps)
 # Labels of the energies in legends.
 _ENERGIES = {
     "work": "work of loads and motions",
@@ -310,7 +309,7 @@ def _choose_magnification(problem: ContactProblem) -> float:
     size = problem.full.scales.mesh_size
     if any(contact.finite for contact in problem.contacts) or not largest > _ROUND_OFF_RATIO * size:
         return 1.0
-    upper_bound = _MIN_DRAWN_RATIO * size / largest
+    upper_bound = _MAGNIFIED_RATIO * size / largest
     power = 10.0 ** np.floor(np.log10(upper_bound))
     return float(max(1.0, power * max(n for n in (1, 2, 5) if n * power <= upper_bound)))
 

@@ -1,1 +1,1 @@
-"""Files and pictures."""
+"""Result files, figures and animations."""

@@ -1,4 +1,4 @@
-"""Γc of a plane body as curves, and the values at its points along them."""
+"""Values at the points of Γc of a plane body, ordered along its curves."""
 
 from __future__ import annotations
 
@@ -18,28 +18,27 @@ from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Along", "along"]
 
-# How far beyond the contact is shown, by the extent of the contact.
-_MARGIN = 0.25
-# Round-off of coordinates, by the largest, and of a facet's way along an axis, by its length.
-_ROUND_OFF = 1e-9
-# Largest difference between the radii of a curve that is a circle, by the mean radius.
-_ROUND = 0.01
+# Range shown beyond the contact, relative to the extent of the contact.
+_MARGIN_RATIO = 0.25
+# Round-off of coordinates relative to the largest, and of projected facets relative to their length.
+_ROUND_OFF_RATIO = 1e-9
+# Largest variation of the radius of a circular curve, relative to the mean radius.
+_RADIUS_VARIATION_RATIO = 0.01
 
 
 @dataclass(frozen=True)
 class Along:
-    """Values at the points of Γc in the order in which they lie on it, body on the left.
+    """Values at the points of Γc, ordered along it with the body on the left.
 
     Attributes:
-        label: What the abscissa is, with its unit.
-        abscissa: A coordinate of the points in which Γc does not turn back about the contact, by
-            preference that along which the contact reaches farthest; if there is none the angle
-            about the middle where Γc is round (degrees), else the arc length along the undeformed
-            Γc (length), (n_points,).
-        is_angle: Whether it is an angle.
-        curves: Of each connected curve of Γc the points about the contact, (n_points,) each.
-        values: At all points, by name: x, gap, pressure, friction (the size of the tangential
-            traction), slip (sum of the modes), status.
+        label: Quantity and unit of the abscissa.
+        abscissa: The coordinate of largest extent of the contact in which Γc is monotonic near the
+            contact; else the angle about the centre of a circular Γc (degrees), or else the arc
+            length along the undeformed Γc (length), (n_points,).
+        is_angle: Whether the abscissa is an angle.
+        curves: For each connected curve of Γc, which points are near the contact, (n_points,) each.
+        values: Values at all points, by name: x, gap, pressure, friction (magnitude of the
+            tangential traction), slip (sum of the modes), status.
     """
 
     label: str
@@ -50,9 +49,9 @@ class Along:
 
 
 def along(contact: Contact, unit: str = "mm") -> Along | None:
-    """Order the points of Γc of a plane body along it; on the first rank, else None. Collective.
+    """Order the points of Γc of a plane body; on the first rank, else None. Collective.
 
-    The unit is that of length, for the label.
+    The label states the unit of length.
     """
     facets = FacetSet(contact.displacement.u.function_space, contact.surface.facets)
     rows = contact.quadrature.point_rows
@@ -75,153 +74,153 @@ def along(contact: Contact, unit: str = "mm") -> Along | None:
     if parts is None:
         return None
     ends, vertices, normals, lengths = parts[:4]
-    # Facets run with the body on the left, their outward normal on the right.
+    # Orient facets with the body on the left, the outward normal on the right.
     edges = ends[:, 1] - ends[:, 0]
-    back = edges[:, 1] * normals[:, 0] < edges[:, 0] * normals[:, 1]
-    ends[back], vertices[back] = ends[back, ::-1], vertices[back, ::-1]
+    flip = edges[:, 1] * normals[:, 0] < edges[:, 0] * normals[:, 1]
+    ends[flip], vertices[flip] = ends[flip, ::-1], vertices[flip, ::-1]
     at_points = dict(zip(fields, parts[4:], strict=True))
-    bears = np.any(at_points["status"] != Status.OPEN, axis=1)
+    in_contact = np.any(at_points["status"] != Status.OPEN, axis=1)
     chains = _chains(vertices, ends)
-    chains = [(_cut(chain, bears, lengths) if ring else chain, ring) for chain, ring in chains]
+    chains = [(_cut(chain, in_contact, lengths) if ring else chain, ring) for chain, ring in chains]
 
-    # Within a facet by the projection on its chord.
+    # Order the points of a facet by their projection onto its chord.
     edges = ends[:, 1] - ends[:, 0]
     arm = at_points["x"] - ends[:, :1]
-    share = np.einsum("fpd,fd->fp", arm, edges) / np.sum(edges**2, axis=1)[:, None]
+    fraction = np.einsum("fpd,fd->fp", arm, edges) / np.sum(edges**2, axis=1)[:, None]
     sequence = np.concatenate([chain for chain, _ in chains])
-    n = share.shape[1]
-    facet, point = np.repeat(sequence, n), np.argsort(share, axis=1)[sequence].ravel()
-    begins = np.zeros(len(ends))
-    begins[sequence] = np.cumsum(lengths[sequence]) - lengths[sequence]
-    arc = begins[facet] + share[facet, point] * lengths[facet]
+    n = fraction.shape[1]
+    facet, point = np.repeat(sequence, n), np.argsort(fraction, axis=1)[sequence].ravel()
+    arc_at_start = np.zeros(len(ends))
+    arc_at_start[sequence] = np.cumsum(lengths[sequence]) - lengths[sequence]
+    arc = arc_at_start[facet] + fraction[facet, point] * lengths[facet]
     values = {name: array[facet, point] for name, array in at_points.items()}
     number = np.repeat(np.arange(len(chains)), [len(chain) * n for chain, _ in chains])
-    closed = np.isin(facet, _with_neighbours(chains, bears)) | (not bears.any())
+    near = np.isin(facet, _contact_facets(chains, in_contact)) | (not in_contact.any())
 
     axes = [
         i
-        for i in np.argsort(-np.ptp(values["x"][closed], axis=0))
-        if _advances(edges[:, i] / lengths, facet, number, _about(values["x"][:, i], closed))
+        for i in np.argsort(-np.ptp(values["x"][near], axis=0))
+        if _is_monotonic(edges[:, i] / lengths, facet, number, _in_range(values["x"][:, i], near))
     ]
-    middle = _middle(chains, ends)
+    centre = _common_centre(chains, ends)
     is_angle = False
     if axes:
         abscissa, label = values["x"][:, axes[0]], f"{'xy'[axes[0]]} [{unit}]"
-    elif middle is not None:
+    elif centre is not None:
         is_angle = True
-        abscissa = _angles(values["x"] - middle, number)
-        label = f"angle about {_place(middle, ends)}, from the x axis [°]"
+        abscissa = _angles(values["x"] - centre, number)
+        label = f"angle about {_format_point(centre, ends)}, from the x axis [°]"
     else:
         start = ends[sequence[0], 0]
-        abscissa, label = arc, f"arc length along Γc, from {_place(start, ends)} [{unit}]"
-    shown = _about(abscissa, closed)
+        abscissa, label = arc, f"arc length along Γc, from {_format_point(start, ends)} [{unit}]"
+    shown = _in_range(abscissa, near)
     curves = [shown & (number == n) for n in range(len(chains))]
     return Along(label, abscissa, is_angle, [curve for curve in curves if curve.any()], values)
 
 
-def _place(x: Array, ends: Array) -> str:
-    """A place in words, round-off as 0."""
-    told = np.where(np.abs(x) > _ROUND_OFF * np.abs(ends).max(), x, 0.0)
-    return f"({told[0]:.4g}, {told[1]:.4g})"
+def _format_point(x: Array, ends: Array) -> str:
+    """Format coordinates, with round-off set to zero."""
+    x = np.where(np.abs(x) > _ROUND_OFF_RATIO * np.abs(ends).max(), x, 0.0)
+    return f"({x[0]:.4g}, {x[1]:.4g})"
 
 
 def _chains(vertices: Index, ends: Array) -> list[tuple[Index, bool]]:
-    """Facets one after another, and whether the last leads to the first; open curves first.
+    """Return connected curves, open ones first, as facets and whether they are closed.
 
     Args:
-        vertices: Where facets begin and end, by number, (n_facets, 2).
-        ends: The same places, (n_facets, 2, 2).
+        vertices: First and last vertex of the facets, (n_facets, 2).
+        ends: Their coordinates, (n_facets, 2, 2).
     """
     order = by_place(ends[:, 0])
     leaving: dict[int, list[int]] = {}
     for facet in order[::-1]:
         leaving.setdefault(int(vertices[facet, 0]), []).append(int(facet))
     starts = order[~np.isin(vertices[order, 0], vertices[:, 1])]
-    left, found = set(range(len(vertices))), []
+    remaining, chains = set(range(len(vertices))), []
     for first in [*starts, *order]:
         chain: list[int] = []
-        begins = at = int(vertices[first, 0])
-        while int(first) in left or chain:
-            following = [facet for facet in leaving.get(at, []) if facet in left]
+        start = vertex = int(vertices[first, 0])
+        while int(first) in remaining or chain:
+            following = [facet for facet in leaving.get(vertex, []) if facet in remaining]
             if not following:
                 break
             chain.append(following[-1])
-            left.discard(chain[-1])
-            at = int(vertices[chain[-1], 1])
+            remaining.discard(chain[-1])
+            vertex = int(vertices[chain[-1], 1])
         if chain:
-            found.append((np.array(chain), at == begins))
-    return found
+            chains.append((np.array(chain), vertex == start))
+    return chains
 
 
-def _cut(ring: Index, bears: Mask, lengths: Array) -> Index:
-    """Facets of a closed curve from the middle of the longest stretch that bears nothing."""
-    borne = np.flatnonzero(bears[ring])
-    if not len(borne):
+def _cut(ring: Index, in_contact: Mask, lengths: Array) -> Index:
+    """Cut a closed curve in the middle of its longest part without contact; return its facets."""
+    loaded = np.flatnonzero(in_contact[ring])
+    if not len(loaded):
         return ring
-    ring = np.roll(ring, -int(borne[0]))
+    ring = np.roll(ring, -int(loaded[0]))
     ends = np.cumsum(lengths[ring])
-    marks = np.append(np.flatnonzero(bears[ring]), len(ring))
-    stretch = ends[marks[1:] - 1] - ends[marks[:-1]]
-    widest = int(np.argmax(stretch))
-    place = ends[marks[widest]] + stretch[widest] / 2
-    return np.roll(ring, -int(np.searchsorted(ends, place)))
+    loaded = np.append(np.flatnonzero(in_contact[ring]), len(ring))
+    open_length = ends[loaded[1:] - 1] - ends[loaded[:-1]]
+    longest = int(np.argmax(open_length))
+    cut = ends[loaded[longest]] + open_length[longest] / 2
+    return np.roll(ring, -int(np.searchsorted(ends, cut)))
 
 
-def _with_neighbours(chains: list[tuple[Index, bool]], bears: Mask) -> Index:
-    """Facets that bear, and those before and after them."""
-    found = []
+def _contact_facets(chains: list[tuple[Index, bool]], in_contact: Mask) -> Index:
+    """Return the facets in contact and their neighbours."""
+    facets = []
     for chain, ring in chains:
-        borne = bears[chain]
-        before, after = np.roll(borne, 1), np.roll(borne, -1)
+        loaded = in_contact[chain]
+        before, after = np.roll(loaded, 1), np.roll(loaded, -1)
         if not ring:
             before[0] = after[-1] = False
-        found.append(chain[borne | before | after])
-    return np.concatenate(found)
+        facets.append(chain[loaded | before | after])
+    return np.concatenate(facets)
 
 
-def _about(abscissa: Array, closed: Mask) -> Mask:
-    """Points in contact, and those somewhat beyond it."""
-    low, high = abscissa[closed].min(), abscissa[closed].max()
-    margin = _MARGIN * (high - low)
+def _in_range(abscissa: Array, near: Mask) -> Mask:
+    """Return which points are within the range of ``near`` points, extended by the margin."""
+    low, high = abscissa[near].min(), abscissa[near].max()
+    margin = _MARGIN_RATIO * (high - low)
     return np.asarray((abscissa >= low - margin) & (abscissa <= high + margin))
 
 
-def _advances(slope: Array, facet: Index, number: Index, shown: Mask) -> bool:
-    """Whether the facets of shown points advance along an axis all one way on every curve.
+def _is_monotonic(slope: Array, facet: Index, number: Index, shown: Mask) -> bool:
+    """Return whether every curve is monotonic along an axis at the shown points.
 
     Args:
-        slope: Of facets the share of their length that is along the axis, (n_facets,).
-        facet: Of points, (n_points,).
-        number: Of the curves of points, (n_points,).
+        slope: Cosine of the angle between facets and the axis, (n_facets,).
+        facet: Facet of each point, (n_points,).
+        number: Curve of each point, (n_points,).
         shown: Which points are shown, (n_points,).
     """
-    signs = np.where(np.abs(slope) > _ROUND_OFF, np.sign(slope), 0)[facet]
+    signs = np.where(np.abs(slope) > _ROUND_OFF_RATIO, np.sign(slope), 0)[facet]
     kinds = (np.unique(signs[shown & (number == n)]) for n in np.unique(number[shown]))
     return all(len(kind) == 1 and kind[0] != 0 for kind in kinds)
 
 
-def _middle(chains: list[tuple[Index, bool]], ends: Array) -> Array | None:
-    """The common centre of curves that are circles about it, (2,); None: they are none.
+def _common_centre(chains: list[tuple[Index, bool]], ends: Array) -> Array | None:
+    """Return the centre of concentric circular curves, (2,), or None if they are not circular.
 
-    By least squares of |x|² = 2 c·x + k, k of every curve its own.
+    It is the least-squares solution c of |x|² = 2 c·x + k, with one k per curve.
     """
-    places = [ends[chain].reshape(-1, 2) for chain, _ in chains]
-    x = np.concatenate(places)
-    curve = np.repeat(np.arange(len(places)), [len(p) for p in places])
+    points = [ends[chain].reshape(-1, 2) for chain, _ in chains]
+    x = np.concatenate(points)
+    curve = np.repeat(np.arange(len(points)), [len(p) for p in points])
     origin = x.mean(axis=0)
-    matrix: Any = np.column_stack([2 * (x - origin), np.eye(len(places))[curve]])
-    found, _, rank, _ = np.linalg.lstsq(matrix, np.sum((x - origin) ** 2, axis=1))
+    matrix: Any = np.column_stack([2 * (x - origin), np.eye(len(points))[curve]])
+    solution, _, rank, _ = np.linalg.lstsq(matrix, np.sum((x - origin) ** 2, axis=1))
     if rank < matrix.shape[1]:
         return None
-    middle = origin + found[:2]
-    radii = [np.linalg.norm(place - middle, axis=1) for place in places]
-    if any(np.ptp(r) > _ROUND * r.mean() for r in radii):
+    centre = origin + solution[:2]
+    radii = [np.linalg.norm(p - centre, axis=1) for p in points]
+    if any(np.ptp(r) > _RADIUS_VARIATION_RATIO * r.mean() for r in radii):
         return None
-    return middle
+    return centre
 
 
 def _angles(arm: Array, number: npt.NDArray[Any]) -> Array:
-    """Angles of arms in degrees, without a jump on any curve, the middle of each within ±180°."""
+    """Return angles of vectors in degrees, continuous on each curve, with its middle in ±180°."""
     angles = np.degrees(np.arctan2(arm[:, 1], arm[:, 0]))
     for n in np.unique(number):
         curve = number == n

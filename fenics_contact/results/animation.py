@@ -1,4 +1,4 @@
-"""Animation of a load history: the deforming body in a GIF. Needs matplotlib."""
+"""Animations of load histories (GIF). Needs matplotlib."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from fenics_contact.types import Array
 
 __all__ = ["Animation"]
 
-# The body where no stress is drawn, and the edges of its cells.
+# Colours of a body without stress, and of the edges of its cells.
 _BODY, _EDGES = "#e3ebf5", "#11111180"
 
 
@@ -76,19 +76,19 @@ class Animation:
         drawing.check_view(view)
         self.path, self._problem = Path(path), problem
         self._magnification, self._rate = float(magnification), float(rate)
-        self._words = unit, stress_unit, title
+        self._texts = unit, stress_unit, title
         self._view = view
         self._comm = problem.u.function_space.mesh.comm
         self._shape = drawing.ShapeOf(problem.displacement.u, stress)
         self._n_frames = 0
-        self._folder = Path()  # of what is to be drawn, on the first rank
-        self._obstacles: list[ObstacleShape] = []  # there
+        self._folder = Path()  # temporary folder of the frames' data, on the first rank
+        self._obstacles: list[ObstacleShape] = []  # on the first rank
         with collective_errors(self._comm):
             if self._comm.rank == 0:
-                drawing.pyplot()  # whether it is there
+                drawing.pyplot()  # raises an error without matplotlib
                 self._obstacles = shapes_of(problem.contacts)
                 files.make_folder(self.path.parent)
-                # Where there is room for the film; /tmp may be memory.
+                # Not /tmp, which may be a small file system in memory.
                 folder, prefix = self.path.parent, f".{self.path.stem}."
                 self._folder = Path(tempfile.mkdtemp(dir=folder, prefix=prefix))
                 weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
@@ -106,10 +106,10 @@ class Animation:
             OSError: The disk is full; the frame is omitted. Raised on all ranks.
         """
         if isinstance(state, Step):
-            words = f"increment {state.increment}"
-            words += "" if state.load is None else f", load {state.load:.4g}"
+            title = f"increment {state.increment}"
+            title += "" if state.load is None else f", load {state.load:.4g}"
         elif isinstance(state, str):
-            words = state
+            title = state
         else:
             raise ValueError(f"state is {state!r}; it must be a Step, or a title (str)")
         self._problem.complete()
@@ -117,19 +117,19 @@ class Animation:
         shape, ends, status = self._shape(), [], []
         if self._problem.displacement.u.function_space.mesh.topology.dim == 2:
             for contact in self._problem.contacts:
-                found = drawing.facets_of(contact, facet_status(contact))
-                if found is not None:
-                    ends.append(found[0] + self._magnification * found[1])
-                    status.append(found[2])
+                facets = drawing.facets_of(contact, facet_status(contact))
+                if facets is not None:
+                    ends.append(facets[0] + self._magnification * facets[1])
+                    status.append(facets[2])
         with collective_errors(self._comm):
             if shape is not None:
-                frame = {"body": shape.deformed(self._magnification), "words": np.array(words)}
+                frame = {"body": shape.deformed(self._magnification), "title": np.array(title)}
                 if shape.stress is not None:
                     frame["stress"] = shape.stress
                 if ends:
                     frame |= {"ends": np.concatenate(ends), "status": np.concatenate(status)}
                 frame |= {f"obstacle {i}": o.state() for i, o in enumerate(self._obstacles)}
-                np.savez(self._frame(self._n_frames), **frame)  # type: ignore[arg-type]
+                np.savez(self._frame_path(self._n_frames), **frame)  # type: ignore[arg-type]
         self._n_frames += 1
 
     def save(self) -> None:
@@ -143,7 +143,7 @@ class Animation:
             raise ValueError(f"{self.path} would have no frame; call add(step) first")
         with collective_errors(self._comm):
             if self._comm.rank == 0:
-                frames = self._drawn()
+                frames = self._render()
                 first = next(frames)
                 with files.atomic_write(self.path) as temporary:
                     first.save(
@@ -154,36 +154,36 @@ class Animation:
                         loop=0,
                     )
 
-    def _frame(self, number: int) -> Path:
+    def _frame_path(self, number: int) -> Path:
         return self._folder / f"{number:06d}.npz"
 
     def _frames(self) -> Iterator[dict[str, Array]]:
-        """What is to be drawn, state by state."""
+        """Read the data of the frames, one at a time."""
         for number in range(self._n_frames):
-            with np.load(self._frame(number)) as frame:
+            with np.load(self._frame_path(number)) as frame:
                 yield dict(frame)
 
-    def _drawn(self) -> Iterator[Any]:
-        """The frames as images of Pillow, one at a time."""
+    def _render(self) -> Iterator[Any]:
+        """Draw the frames as Pillow images, one at a time."""
         from matplotlib.patches import Patch
         from PIL import Image
 
-        # Axes and colours of all of them.
-        corners, largest, surfaces = [], 0.0, False
+        # Limits of axes and colours over all frames.
+        corners, largest, has_surfaces = [], 0.0, False
         for frame in self._frames():
-            surfaces |= "ends" in frame
+            has_surfaces |= "ends" in frame
             flat = frame["body"].reshape(-1, frame["body"].shape[2])
             corners.append(np.array([flat.min(axis=0), flat.max(axis=0)]))
             largest = max(largest, frame.get("stress", np.zeros(0)).max(initial=0.0))
-        unit, stress_unit, title = self._words
+        unit, stress_unit, title = self._texts
         margin = drawing.MARGIN[bool(self._obstacles)]
-        places = np.array(corners)
-        figure, axes = drawing.made_axes(places, unit, title, self._view, margin)
-        box = box_about(places, margin)
+        bounds = np.array(corners)
+        figure, axes = drawing.made_axes(bounds, unit, title, self._view, margin)
+        box = box_about(bounds, margin)
         colours = drawing.scale_of(0.0, largest)
-        body_of = drawing.magnified(self._magnification)
-        handles = [Patch(fc=_BODY, ec=_EDGES, label=body_of)]
-        handles += drawing.status_patches() if surfaces else []
+        label = drawing.magnified(self._magnification)
+        handles = [Patch(fc=_BODY, ec=_EDGES, label=label)]
+        handles += drawing.status_patches() if has_surfaces else []
         if self._obstacles:
             handles.append(drawing.obstacle_entry(box.shape[1]))
         figure.legend(handles=handles, loc="outside lower center", ncols=3)
@@ -196,21 +196,21 @@ class Animation:
                         bar = {"label": f"von Mises stress [{stress_unit}]", "shrink": 0.8}
                         figure.colorbar(colours, ax=axes, **bar)
                 body = drawing.polygons(frame["body"], faces, _EDGES, 0.2)
-                drawn = [axes.add_collection(body)]
+                artists = [axes.add_collection(body)]
                 if "ends" in frame:
-                    of_status = drawing.status_colours(frame["status"])
-                    line = drawing.on_surface(frame["ends"], of_status)
+                    line_colours = drawing.status_colours(frame["status"])
+                    line = drawing.on_surface(frame["ends"], line_colours)
                     line.set_linewidth(3.0)
-                    drawn.append(axes.add_collection(line))
+                    artists.append(axes.add_collection(line))
                 for i, shape in enumerate(self._obstacles):
                     surface = shape(box, self._magnification, frame[f"obstacle {i}"])
                     if len(surface):
-                        drawn.append(axes.add_collection(drawing.on_obstacle(surface)))
-                axes.set_title(f"{title}: {frame['words']}" if title else str(frame["words"]))
+                        artists.append(axes.add_collection(drawing.on_obstacle(surface)))
+                axes.set_title(f"{title}: {frame['title']}" if title else str(frame["title"]))
                 figure.canvas.draw()
                 image = Image.fromarray(np.array(figure.canvas.buffer_rgba())).convert("RGB")
                 yield image.quantize()
-                for each in drawn:
-                    each.remove()
+                for artist in artists:
+                    artist.remove()
         finally:
             drawing.pyplot().close(figure)

@@ -1,4 +1,4 @@
-"""Files that are complete or not there, whenever and however writing them ends; folders."""
+"""Atomic writing of files, and checks of files and folders."""
 
 from __future__ import annotations
 
@@ -12,13 +12,9 @@ __all__ = ["atomic_write", "check_file", "check_folder", "make_folder"]
 
 
 def check_file(path: Path) -> None:
-    """Refuse what is there and is no file, such as /dev/null. On the calling rank only.
+    """Raise ValueError for a device, a pipe or a socket. On the calling rank only.
 
-    A device may be read without end, a pipe waits for another program, and either would be gone
-    where a file took its place. A folder has an error of its own where it is opened.
-
-    Raises:
-        ValueError: It is a device, a pipe or a socket.
+    Reading from one may not end, and an atomic write would replace it.
     """
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise ValueError(
@@ -28,11 +24,11 @@ def check_file(path: Path) -> None:
 
 
 def check_folder(name: str, path: Path) -> None:
-    """Refuse a file whose folder is not there, or takes no files. On the calling rank only.
+    """Check that the folder of a file exists and is writable. On the calling rank only.
 
     Raises:
-        ValueError: There is no such folder; it names the argument.
-        OSError: Nothing can be written to it.
+        ValueError: The folder does not exist.
+        OSError: The folder is not writable.
     """
     folder = path.parent
     if not folder.is_dir():
@@ -40,21 +36,21 @@ def check_folder(name: str, path: Path) -> None:
     try:
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        words = f"{name} is {path}, but folder {folder} is not writable"
-        raise OSError(f"{words}: {error.strerror}") from error
+        text = f"{name} is {path}, but folder {folder} is not writable"
+        raise OSError(f"{text}: {error.strerror}") from error
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder for files, and those above it, if it is not there. On the calling rank only.
+    """Create a folder and its parents, if necessary. On the calling rank only.
 
     Raises:
-        NotADirectoryError: Something else has its name, or that of one above it.
-        OSError: It cannot be made, or nothing can be written to it.
+        NotADirectoryError: The path or a parent exists and is no folder.
+        OSError: The folder cannot be created, or is not writable.
     """
-    there = next((p for p in (path, *path.parents) if p.exists()), None)
-    if there is not None and not there.is_dir():
+    existing = next((p for p in (path, *path.parents) if p.exists()), None)
+    if existing is not None and not existing.is_dir():
         raise NotADirectoryError(
-            f"{path} must be a folder, but {there} is a file; give another name, or remove it"
+            f"{path} must be a folder, but {existing} is a file; give another name, or remove it"
         )
     path.mkdir(parents=True, exist_ok=True)
     tempfile.TemporaryFile(dir=path).close()
@@ -62,12 +58,12 @@ def make_folder(path: Path) -> None:
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A name to write to, which takes the place of ``path`` once the block has ended well.
+    """Provide a temporary path, which replaces ``path`` if the block ends without an error.
 
-    Else ``path`` is as before. On the calling rank only.
+    After an error ``path`` is unchanged. On the calling rank only.
 
     Raises:
-        FileNotFoundError: Its folder is not there.
+        FileNotFoundError: The folder does not exist.
         ValueError: ``path`` is a device, a pipe or a socket.
     """
     path = Path(path)
@@ -76,12 +72,12 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise FileNotFoundError(
             f"{path} cannot be written, because there is no folder {path.parent}; create it"
         )
-    # The ending stays: it may tell the format.
+    # The suffix may determine the format.
     temporary = path.with_name(f".{os.getpid()}.part.{path.name}")
     try:
         yield temporary
         with open(temporary, "rb") as file:
-            os.fsync(file.fileno())  # a full disk may show only here
+            os.fsync(file.fileno())  # may be the first call to fail on a full disk
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
