@@ -36,7 +36,7 @@ def test_a_frame_is_a_state(cell, tmp_path, monkeypatch):
     folder = shared_folder(tmp_path)
     made, sigma = rubbed(cell)
     bodies, colours, axes, figures = [], [], [], []
-    polygons, made_axes, scale_of = drawing.polygons, drawing.made_axes, drawing.scale_of
+    polygons, create_axes, colour_scale = drawing.polygons, drawing.create_axes, drawing.colour_scale
 
     def drawn(corners, faces, *rest):
         if not isinstance(faces, str):  # as those of obstacles are
@@ -46,16 +46,16 @@ def test_a_frame_is_a_state(cell, tmp_path, monkeypatch):
 
     def framed(places, *rest):
         axes.append(places.reshape(-1, places.shape[-1]))
-        made = made_axes(places, *rest)
+        made = create_axes(places, *rest)
         figures.append(made[0])
         return made
 
     monkeypatch.setattr(drawing, "polygons", drawn)
-    monkeypatch.setattr(drawing, "made_axes", framed)
+    monkeypatch.setattr(drawing, "create_axes", framed)
     film = fc.Animation(
         folder / "new" / "film.gif", made.problem, stress=sigma, magnification=2.0, rate=4.0
     )
-    shape_of, shapes = drawing.ShapeOf(made.scene.u, sigma), []
+    shape_of, shapes = drawing.ShapeEvaluator(made.scene.u, sigma), []
     for step in fc.increments(made.problem, made.load, 0, 2, steps=4):
         film.add(step)
         shapes.append(shape_of())
@@ -66,9 +66,9 @@ def test_a_frame_is_a_state(cell, tmp_path, monkeypatch):
             assert image.n_frames == 4 and image.info["duration"] == 250
         assert len(bodies) == 4
         largest = max(shape.stress.max() for shape in shapes)
-        scale = scale_of(0.0, largest)
+        scale = colour_scale(0.0, largest)
         for shape, body, faces in zip(shapes, bodies, colours, strict=True):
-            assert close(body, shape.original + 2 * shape.moved, 1e-14)
+            assert close(body, shape.original + 2 * shape.displacement, 1e-14)
             assert close(faces, scale.to_rgba(shape.stress), 1e-14)
         assert shapes[0].stress.max() < 0.9 * largest
         (places,) = axes

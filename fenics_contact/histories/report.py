@@ -42,10 +42,10 @@ _ENERGIES = {
     "remainder": "remainder",
 }
 _REMAINDER = (
-    "The work of an increment is computed with the mean of the forces at its two ends. Contact that "
-    "changes within an increment, and contact springs that are released at opening, leave a "
-    "remainder. It decreases with the increment size; if it is large compared with the work, the "
-    "increments are too large for accurate energies."
+    "The work of an increment is computed with the mean of the forces at its two ends. Changes of "
+    "contact within an increment, and contact springs released at opening, leave a remainder. It "
+    "decreases with the increment size; if it is large compared with the work, the increments are "
+    "too large for accurate energies."
 )
 _STYLE = """
 body { font: 15px/1.5 sans-serif; color: #1a1a1a; max-width: 72rem; margin: 2rem auto;
@@ -125,7 +125,7 @@ def report(
     _check(problem, steps, folder, csv, budget, title, units, magnification)
     drawing.check_view(view)
     comm, path = problem.u.function_space.mesh.comm, Path(folder) / "report.html"
-    shape = drawing.ShapeOf(problem.displacement.u, stress)  # refuses stresses of other shapes
+    evaluator = drawing.ShapeEvaluator(problem.displacement.u, stress)  # checks the stress
     rows: list[dict[str, str]] = []
     with ExitStack() as stack:
         scratch = Path()
@@ -140,7 +140,7 @@ def report(
         page = _Page(scratch, units, view, per_thickness=table.is_per_thickness(problem))
         if magnification is None:
             magnification = _choose_magnification(problem)
-        _add_state(page, problem, steps[-1], shape, magnification)
+        _add_state(page, problem, steps[-1], evaluator, magnification)
         for contact in problem.contacts:
             _add_contact(page, contact, steps[-1], magnification)
         with collective_errors(comm):
@@ -315,7 +315,11 @@ def _choose_magnification(problem: ContactProblem) -> float:
 
 
 def _add_state(
-    page: _Page, problem: ContactProblem, step: Step, shape: drawing.ShapeOf, magnification: float
+    page: _Page,
+    problem: ContactProblem,
+    step: Step,
+    evaluator: drawing.ShapeEvaluator,
+    magnification: float,
 ) -> None:
     """Add the verdict in words, resultants and the deformed body. Collective."""
     failures = step.verdict.failures
@@ -342,12 +346,12 @@ def _add_state(
     page.add(step._repr_html_())
     page.add_heading("Deformed body")
     path = page.next_path()
-    body = shape()
+    body = evaluator()
     with collective_errors(problem.u.function_space.mesh.comm):
         if body is not None:
             units = page.length, page.stress
             obstacles = shapes_of(problem.contacts)
-            figure = drawing.deformed(body, units, "", magnification, obstacles, page.view)
+            figure = drawing.draw_deformation(body, units, "", magnification, obstacles, page.view)
             drawing.save(figure, path)
     scale = "" if magnification == 1 else f", displacements × {magnification:g}"
     page.add_pictures(page.picture(path, f"Original and deformed mesh{scale}"))

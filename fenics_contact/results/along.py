@@ -20,7 +20,7 @@ __all__ = ["Along", "along"]
 
 # Range shown beyond the contact, relative to the extent of the contact.
 _MARGIN_RATIO = 0.25
-# Round-off of coordinates relative to the largest, and of projected facets relative to their length.
+# Round-off relative to the largest coordinate, and of projected facets relative to their length.
 _ROUND_OFF_RATIO = 1e-9
 # Largest variation of the radius of a circular curve, relative to the mean radius.
 _RADIUS_VARIATION_RATIO = 0.01

@@ -79,7 +79,7 @@ class Animation:
         self._texts = unit, stress_unit, title
         self._view = view
         self._comm = problem.u.function_space.mesh.comm
-        self._shape = drawing.ShapeOf(problem.displacement.u, stress)
+        self._shape = drawing.ShapeEvaluator(problem.displacement.u, stress)
         self._n_frames = 0
         self._folder = Path()  # temporary folder of the frames' data, on the first rank
         self._obstacles: list[ObstacleShape] = []  # on the first rank
@@ -117,7 +117,7 @@ class Animation:
         shape, ends, status = self._shape(), [], []
         if self._problem.displacement.u.function_space.mesh.topology.dim == 2:
             for contact in self._problem.contacts:
-                facets = drawing.facets_of(contact, facet_status(contact))
+                facets = drawing.gather_facets(contact, facet_status(contact))
                 if facets is not None:
                     ends.append(facets[0] + self._magnification * facets[1])
                     status.append(facets[2])
@@ -178,14 +178,14 @@ class Animation:
         unit, stress_unit, title = self._texts
         margin = drawing.MARGIN[bool(self._obstacles)]
         bounds = np.array(corners)
-        figure, axes = drawing.made_axes(bounds, unit, title, self._view, margin)
+        figure, axes = drawing.create_axes(bounds, unit, title, self._view, margin)
         box = box_about(bounds, margin)
-        colours = drawing.scale_of(0.0, largest)
-        label = drawing.magnified(self._magnification)
+        colours = drawing.colour_scale(0.0, largest)
+        label = drawing.magnification_label(self._magnification)
         handles = [Patch(fc=_BODY, ec=_EDGES, label=label)]
-        handles += drawing.status_patches() if has_surfaces else []
+        handles += drawing.status_handles() if has_surfaces else []
         if self._obstacles:
-            handles.append(drawing.obstacle_entry(box.shape[1]))
+            handles.append(drawing.obstacle_handle(box.shape[1]))
         figure.legend(handles=handles, loc="outside lower center", ncols=3)
         try:
             for number, frame in enumerate(self._frames()):
@@ -199,13 +199,13 @@ class Animation:
                 artists = [axes.add_collection(body)]
                 if "ends" in frame:
                     line_colours = drawing.status_colours(frame["status"])
-                    line = drawing.on_surface(frame["ends"], line_colours)
+                    line = drawing.facet_collection(frame["ends"], line_colours)
                     line.set_linewidth(3.0)
                     artists.append(axes.add_collection(line))
                 for i, shape in enumerate(self._obstacles):
                     surface = shape(box, self._magnification, frame[f"obstacle {i}"])
                     if len(surface):
-                        artists.append(axes.add_collection(drawing.on_obstacle(surface)))
+                        artists.append(axes.add_collection(drawing.obstacle_collection(surface)))
                 axes.set_title(f"{title}: {frame['title']}" if title else str(frame["title"]))
                 figure.canvas.draw()
                 image = Image.fromarray(np.array(figure.canvas.buffer_rgba())).convert("RGB")

@@ -1,4 +1,4 @@
-"""What pictures are drawn with: shapes of bodies and of Γc on the first rank, axes, colours."""
+"""Parts of figures: shapes of bodies and of Γc on the first rank, axes, colours, legends."""
 
 from __future__ import annotations
 
@@ -28,30 +28,30 @@ __all__ = [
     "COLOURS",
     "MARGIN",
     "Shape",
-    "ShapeOf",
+    "ShapeEvaluator",
     "Surface",
     "add_obstacles",
     "check_near",
     "check_view",
-    "deformed",
-    "facets_of",
-    "made_axes",
-    "magnified",
-    "obstacle_entry",
-    "on_obstacle",
-    "on_surface",
+    "colour_scale",
+    "create_axes",
+    "draw_deformation",
+    "facet_collection",
+    "gather_facets",
+    "gather_surface",
+    "magnification_label",
+    "obstacle_collection",
+    "obstacle_handle",
     "polygons",
     "pyplot",
     "save",
-    "scale_of",
     "status_colours",
-    "status_patches",
-    "surface_of",
+    "status_handles",
     "von_mises",
 ]
 
 
-# Of the size of what is drawn how much is shown beyond it, with and without obstacles.
+# Margin of figures relative to their content, with and without obstacles.
 MARGIN = {True: 0.08, False: 0.03}
 COLOURS = {
     "pressure": "#1f5fa8",
@@ -60,7 +60,7 @@ COLOURS = {
     "obstacle": "#111111",
     "open": "#d8d8d8",
 }
-# What legends call them, and their colours.
+# Labels and colours of the contact status.
 _STATUS = {
     Status.OPEN: ("open", COLOURS["open"]),
     Status.STICK: ("sticking", COLOURS["pressure"]),
@@ -69,21 +69,13 @@ _STATUS = {
 
 
 def check_near(near: Any) -> None:
-    """Refuse what is no distance.
-
-    Raises:
-        ValueError: It says what was given.
-    """
+    """Raise ValueError unless ``near`` is None or a positive length."""
     if near is not None:
         check_positive("near", near, "a length greater than zero", infinite=True)
 
 
 def check_view(view: Any) -> None:
-    """Refuse what is no elevation and azimuth.
-
-    Raises:
-        ValueError: It says what was given.
-    """
+    """Raise ValueError unless ``view`` is None or elevation and azimuth."""
     if view is None:
         return
     if np.shape(view) != (2,) or not all(is_number(angle) and np.isfinite(angle) for angle in view):
@@ -93,41 +85,40 @@ def check_view(view: Any) -> None:
 
 
 def von_mises(stress: Array) -> Array:
-    """√(3/2 s:s) of tensors (…, 3, 3), s their deviator: (…)."""
+    """Return √(3/2 s:s), (…), of tensors (…, 3, 3) with the deviator s."""
     mean = np.trace(stress, axis1=-2, axis2=-1)[..., None, None] / 3
     return np.asarray(np.sqrt(1.5 * np.sum((stress - mean * np.eye(3)) ** 2, axis=(-2, -1))))
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A body on the first rank.
+    """The cells of a plane body, or the boundary facets of a body in space, on the first rank.
 
     Attributes:
-        original: Corners of all cells, in space of the boundary's facets, (n, n_corners, d).
-        moved: By how much they have moved.
-        stress: Von Mises stress in the middle of the cells, (n,); None where none was given.
+        original: Undeformed corners, (n, n_corners, d).
+        displacement: Displacement of the corners, (n, n_corners, d).
+        stress: Von Mises stress at the midpoint of the cells, (n,), or None.
     """
 
     original: Array
-    moved: Array
+    displacement: Array
     stress: Array | None = None
 
     def deformed(self, magnification: float) -> Array:
-        """Corners, displaced by so many times as much."""
-        return self.original + magnification * self.moved
+        """Return the corners with magnified displacement."""
+        return self.original + magnification * self.displacement
 
 
-class ShapeOf:
-    """Makes `Shape` of a displacement and a stress, as they are when it is called.
-
-    The constructor finds the facets, and compiles. It is collective.
+class ShapeEvaluator:
+    """Evaluates the present `Shape` of a body when called. The constructor is collective.
 
     Args:
-        stress: UFL tensor (3, 3); None: there is none.
+        u: Displacement.
+        stress: UFL tensor (3, 3), whose von Mises stress is evaluated; or None.
 
     Raises:
-        ValueError: u is no displacement; or the stress has another shape: without the stress
-            across a plane body that of von Mises is not known.
+        ValueError: u is no displacement, or the stress has another shape. The von Mises stress of a
+            plane body depends on the out-of-plane stress.
     """
 
     def __init__(self, u: fem.Function, stress: Any = None) -> None:
@@ -159,69 +150,69 @@ class ShapeOf:
             ring = [0, 1, 3, 2] if quadrilateral else [0, 1, 2]
             n = mesh.topology.index_map(self._dim).size_local
             self._corners = space.dofmap.list[:n][:, ring]
-            self._places = space.tabulate_dof_coordinates()[:, : self._dim]
+            self._vertices = space.tabulate_dof_coordinates()[:, : self._dim]
             self._cells = np.arange(n, dtype=np.int32)
 
     def __call__(self) -> Shape | None:
-        """On the first rank all of it; None on the others. Collective."""
+        """Return the shape on the first rank, None on the others. Collective."""
         mesh = self._u.function_space.mesh
         if self._dim == 3:
             original = self._facets.moved_corners(None)
-            moved = self._facets.moved_corners(self._u) - original
+            displacement = self._facets.moved_corners(self._u) - original
         else:
             self._at_corners.interpolate(self._u)
-            original = self._places[self._corners]
-            moved = self._at_corners.x.array.reshape(-1, self._dim)[self._corners]
+            original = self._vertices[self._corners]
+            displacement = self._at_corners.x.array.reshape(-1, self._dim)[self._corners]
         stress: Array = np.zeros(len(self._cells))
         if self._stress is not None and len(self._cells):
             values = np.asarray(self._stress.eval(mesh, self._cells))
             stress = von_mises(values.reshape(-1, 3, 3))
-        gathered = gather_on_first(mesh.comm, original, moved, stress)
+        gathered = gather_on_first(mesh.comm, original, displacement, stress)
         if gathered is None:
             return None
-        original, moved, stress = gathered
-        return Shape(original, moved, None if self._stress is None else stress)
+        original, displacement, stress = gathered
+        return Shape(original, displacement, None if self._stress is None else stress)
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Γc and the body about it, of all ranks.
+    """Γc and the body, of all ranks.
 
     Attributes:
-        body: Corners of cells, or facets of the boundary, (n, n_corners, d).
-        facets: Those of the facets of Γc.
-        values: Of the facets.
-        bears: Which of them have a point that is not open.
-        outward: Sum of their normals.
+        body: Corners of cells, or boundary facets in space, (n, n_corners, d).
+        facets: Corners of the facets of Γc.
+        values: Values on the facets.
+        in_contact: Which facets have a point that is not open.
+        outward: Sum of the facets' normals.
     """
 
     body: Array
     facets: Array
     values: npt.NDArray[Any]
-    bears: Mask
+    in_contact: Mask
     outward: Array
 
-    def around(self, reach: float | None) -> Surface:
-        """What of it is no farther than that from the facets that bear; None: all of it."""
-        if reach is None or not self.bears.any():
+    def crop(self, distance: float | None) -> Surface:
+        """Return the part within a distance of the facets in contact; everything for None."""
+        if distance is None or not self.in_contact.any():
             return self
-        places = self.facets[self.bears]
-        low, high = places.min(axis=(0, 1)) - reach, places.max(axis=(0, 1)) + reach
+        corners = self.facets[self.in_contact]
+        low, high = corners.min(axis=(0, 1)) - distance, corners.max(axis=(0, 1)) + distance
 
-        def near(corners: Array) -> Mask:
-            middle = corners.mean(axis=1)
-            return np.all((middle >= low) & (middle <= high), axis=1)
+        def is_near(corners: Array) -> Mask:
+            midpoint = corners.mean(axis=1)
+            return np.all((midpoint >= low) & (midpoint <= high), axis=1)
 
-        kept = near(self.facets) | self.bears
+        near = is_near(self.facets) | self.in_contact
         return replace(
             self,
-            body=self.body[near(self.body)],
-            facets=self.facets[kept],
-            values=self.values[kept],
-            bears=self.bears[kept],
+            body=self.body[is_near(self.body)],
+            facets=self.facets[near],
+            values=self.values[near],
+            in_contact=self.in_contact[near],
         )
 
-    def axes(
+    def create_axes(
         self,
         unit: str,
         title: str,
@@ -229,71 +220,72 @@ class Surface:
         contact: Contact,
         magnification: float,
     ) -> tuple[Any, Any, list[Any]]:
-        """A figure with the body in it, seen so that Γc is in front unless a view is given.
+        """Return figure, axes and legend handles, with the body and in the plane the obstacle.
 
-        In the plane with the contact's obstacle; in space it would hide Γc. The last are entries of
-        a legend.
+        By default Γc is in front of the body.
         """
         d = self.body.shape[2]
         if view is None and d == 3:
-            view = _towards(self.outward)
-        places = np.concatenate([self.body.reshape(-1, d), self.facets.reshape(-1, d)])
-        shown = shapes_of([contact]) if d == 2 else []
-        margin = MARGIN[bool(shown)]
-        figure, axes = made_axes(places[None], unit, title, view, margin)
+            view = _view_of_surface(self.outward)
+        points = np.concatenate([self.body.reshape(-1, d), self.facets.reshape(-1, d)])
+        obstacles = shapes_of([contact]) if d == 2 else []  # in space it would hide Γc
+        margin = MARGIN[bool(obstacles)]
+        figure, axes = create_axes(points[None], unit, title, view, margin)
         axes.add_collection(polygons(self.body, "#9a9a9a10", "#9a9a9a60", 0.4))
-        handles = add_obstacles(axes, shown, box_about(places, margin), magnification)
+        handles = add_obstacles(axes, obstacles, box_about(points, margin), magnification)
         return figure, axes, handles
 
 
-def surface_of(contact: Contact, values: npt.NDArray[Any], magnification: float) -> Surface | None:
-    """Γc with a value for every facet, on the first rank; None on the others. Collective."""
+def gather_surface(
+    contact: Contact, values: npt.NDArray[Any], magnification: float
+) -> Surface | None:
+    """Gather Γc with a value per facet on the first rank; None on the others. Collective."""
     contact.displacement.follow()
     u, mesh = contact.displacement.u, contact.surface.mesh
     outward = global_sum(
         mesh.comm, FacetSet(u.function_space, contact.surface.facets).mean_normals().sum(axis=0)
     )
-    shape = ShapeOf(u)()
+    shape = ShapeEvaluator(u)()
     status = contact.status[contact.quadrature.point_rows]
-    bearing = gather_on_first(mesh.comm, np.any(status != Status.OPEN, axis=1))
-    gathered = facets_of(contact, values)
-    if gathered is None or bearing is None or shape is None:
+    in_contact = gather_on_first(mesh.comm, np.any(status != Status.OPEN, axis=1))
+    gathered = gather_facets(contact, values)
+    if gathered is None or in_contact is None or shape is None:
         return None
-    original, moved, values = gathered
-    at = original + magnification * moved
-    return Surface(shape.deformed(magnification), at, values, bearing[0], outward)
+    original, displacement, values = gathered
+    facets = original + magnification * displacement
+    return Surface(shape.deformed(magnification), facets, values, in_contact[0], outward)
 
 
-def facets_of(
+def gather_facets(
     contact: Contact, values: npt.NDArray[Any]
 ) -> tuple[Array, Array, npt.NDArray[Any]] | None:
-    """Corners of the facets of Γc, their displacement and values, on the first rank. Collective.
+    """Gather corners, displacements and values of the facets of Γc on the first rank. Collective.
 
-    The displacement is up to date; the values are of this rank's facets.
+    The displacement must be up to date; the values are those of this rank's facets.
     """
     u = contact.displacement.u
     facets = FacetSet(u.function_space, contact.surface.facets)
     original = facets.moved_corners(None)
-    mine = original, facets.moved_corners(u) - original, values
-    gathered = gather_on_first(contact.surface.mesh.comm, *mine)
+    local = original, facets.moved_corners(u) - original, values
+    gathered = gather_on_first(contact.surface.mesh.comm, *local)
     if gathered is None:
         return None
-    original, moved, values = gathered
-    return original, moved, values
+    original, displacement, values = gathered
+    return original, displacement, values
 
 
-def _towards(outward: Array) -> tuple[float, float]:
-    """Elevation and azimuth from which a surface with this normal is seen, somewhat aslant."""
+def _view_of_surface(outward: Array) -> tuple[float, float]:
+    """Return elevation and azimuth for an oblique view of a surface with this normal."""
     x, y, z = outward / (np.linalg.norm(outward) or 1.0)
     elevation = float(np.degrees(np.arcsin(np.clip(z, -1, 1))))
-    flat = np.hypot(x, y) < 0.1
-    azimuth = -60.0 if flat else float(np.degrees(np.arctan2(y, x))) + 25.0
+    is_horizontal = np.hypot(x, y) < 0.1
+    azimuth = -60.0 if is_horizontal else float(np.degrees(np.arctan2(y, x))) + 25.0
     return float(np.clip(elevation, -55.0, 55.0)) + (
         20.0 if abs(elevation) < 20.0 else 0.0
     ), azimuth
 
 
-def deformed(
+def draw_deformation(
     shape: Shape,
     units: tuple[str, str],
     title: str,
@@ -301,35 +293,35 @@ def deformed(
     obstacles: Sequence[ObstacleShape],
     view: tuple[float, float] | None,
 ) -> Any:
-    """The figure of `plotting.plot_deformation`; units are those of length and stress."""
-    original, moved = shape.original, shape.deformed(magnification)
-    places = np.concatenate([original, moved])
+    """Draw the figure of `plotting.plot_deformation`; ``units`` are those of length and stress."""
+    original, deformed = shape.original, shape.deformed(magnification)
+    corners = np.concatenate([original, deformed])
     margin = MARGIN[bool(obstacles)]
-    figure, axes = made_axes(places, units[0], title, view, margin)
-    plane = original.shape[2] == 2  # in space what is behind is hidden
-    if plane:
+    figure, axes = create_axes(corners, units[0], title, view, margin)
+    is_plane = original.shape[2] == 2
+    if is_plane:
         axes.add_collection(polygons(original, "#ffffff00", COLOURS["mesh"], 0.4))
     else:
         from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-        lines = Line3DCollection(list(_ridges(original)), colors=COLOURS["mesh"], linewidths=0.8)
-        axes.add_collection(lines)
-    edges, width = COLOURS["pressure"], 0.5 if plane else 0.3
-    body = faces = "#1f5fa818" if plane else "#e3ebf5e8"
+        lines = list(_sharp_edges(original))
+        axes.add_collection(Line3DCollection(lines, colors=COLOURS["mesh"], linewidths=0.8))
+    edges, width = COLOURS["pressure"], 0.5 if is_plane else 0.3
+    body = faces = "#1f5fa818" if is_plane else "#e3ebf5e8"
     if shape.stress is not None:
-        colours = scale_of(0.0, shape.stress.max(initial=0.0))
+        colours = colour_scale(0.0, shape.stress.max(initial=0.0))
         faces, edges, width = colours.to_rgba(shape.stress), "#11111180", 0.2
         body = colours.to_rgba(shape.stress.max(initial=0.0) / 2)
         figure.colorbar(colours, ax=axes, label=f"von Mises stress [{units[1]}]", shrink=0.8)
-    axes.add_collection(polygons(moved, faces, edges, width))
+    axes.add_collection(polygons(deformed, faces, edges, width))
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     handles = [
         Line2D([], [], color=COLOURS["mesh"], label="original"),
-        Patch(fc=body, ec=edges, label=magnified(magnification)),
+        Patch(fc=body, ec=edges, label=magnification_label(magnification)),
     ]
-    handles += add_obstacles(axes, obstacles, box_about(places, margin), magnification)
+    handles += add_obstacles(axes, obstacles, box_about(corners, margin), magnification)
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
 
@@ -337,16 +329,16 @@ def deformed(
 def add_obstacles(
     axes: Any, obstacles: Sequence[ObstacleShape], box: Array, magnification: float
 ) -> list[Any]:
-    """Draw rigid obstacles where they are within a box; entries of a legend for them."""
+    """Draw the rigid obstacles in a box; return their legend handles."""
     surfaces = [shape(box, magnification) for shape in obstacles]
-    drawn = [on_obstacle(corners) for corners in surfaces if len(corners)]
-    for each in drawn:
-        axes.add_collection(each)
-    return [obstacle_entry(box.shape[1])] if drawn else []
+    collections = [obstacle_collection(corners) for corners in surfaces if len(corners)]
+    for collection in collections:
+        axes.add_collection(collection)
+    return [obstacle_handle(box.shape[1])] if collections else []
 
 
-def obstacle_entry(d: int) -> Any:
-    """Entry of a legend for rigid obstacles in d dimensions."""
+def obstacle_handle(d: int) -> Any:
+    """Return a legend handle for rigid obstacles in d dimensions."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -356,8 +348,8 @@ def obstacle_entry(d: int) -> Any:
     return Line2D([], [], color=colour, linewidth=2.2, label=label)
 
 
-def on_obstacle(corners: Array) -> Any:
-    """Segments of an obstacle, or triangles through which the body can be seen, (n, d, d)."""
+def obstacle_collection(corners: Array) -> Any:
+    """Return a collection of segments or transparent triangles of an obstacle, (n, d, d)."""
     from matplotlib.collections import LineCollection
 
     if corners.shape[2] == 3:
@@ -367,14 +359,13 @@ def on_obstacle(corners: Array) -> Any:
     return lines
 
 
-def magnified(magnification: float) -> str:
-    """What a legend calls the deformed body."""
-    true = magnification == 1.0
-    return "deformed (true scale)" if true else f"displacement × {magnification:g}"
+def magnification_label(magnification: float) -> str:
+    """Return the label of the deformed body in legends."""
+    return "deformed (true scale)" if magnification == 1.0 else f"displacement × {magnification:g}"
 
 
-def _ridges(facets: Array) -> Array:
-    """Ends of the edges at which facets in space, (n, n_corners, 3), meet at more than 30°."""
+def _sharp_edges(facets: Array) -> Array:
+    """Return the edges between facets (n, n_corners, 3) at an angle of more than 30°, (m, 2, 3)."""
     corners = facets.reshape(-1, 3)
     size = float(np.ptp(corners, axis=0).max()) or 1.0
     _, first, number = np.unique(
@@ -383,27 +374,27 @@ def _ridges(facets: Array) -> Array:
     number = number.reshape(facets.shape[:2])
     ends = np.sort(np.stack([number, np.roll(number, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     edges, edge = np.unique(ends, axis=0, return_inverse=True)
-    across = np.cross(facets[:, 1] - facets[:, 0], facets[:, 2] - facets[:, 0])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    normal = np.repeat(across, facets.shape[1], axis=0)
-    # Two facets of any orientation: n n^T of both differ by their angle alone.
-    spread = np.zeros((len(edges), 3, 3))
-    np.add.at(spread, edge.ravel(), normal[:, :, None] * normal[:, None, :])
-    # The largest eigenvalue is 1 + |cos| of the angle; 1 of an edge with one facet.
-    largest = np.linalg.eigvalsh(spread)[:, -1]
+    normals = np.cross(facets[:, 1] - facets[:, 0], facets[:, 2] - facets[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.repeat(normals, facets.shape[1], axis=0)
+    # The sum of n nᵀ over the facets of an edge is independent of their orientation. Its largest
+    # eigenvalue is 1 + |cos(angle)|, or 1 for an edge with one facet.
+    tensor = np.zeros((len(edges), 3, 3))
+    np.add.at(tensor, edge.ravel(), normals[:, :, None] * normals[:, None, :])
+    largest = np.linalg.eigvalsh(tensor)[:, -1]
     return corners[first[edges[largest < 1 + np.cos(np.pi / 6)]]]
 
 
-def made_axes(
-    places: Array,
+def create_axes(
+    points: Array,
     unit: str,
     title: str,
     view: tuple[float, float] | None,
     margin: float = MARGIN[False],
 ) -> tuple[Any, Any]:
-    """A figure and axes of equal scale that hold all places, (n, m, d), and a margin."""
-    plt, d = pyplot(), places.shape[2]
-    low, high = box_about(places, margin)
+    """Create a figure and axes of equal scale for points (n, m, d) and a margin."""
+    plt, d = pyplot(), points.shape[2]
+    low, high = box_about(points, margin)
     labels = dict(
         zip(("xlabel", "ylabel", "zlabel"), (f"{a} [{unit}]" for a in "xyz"), strict=True)
     )
@@ -420,7 +411,7 @@ def made_axes(
     axes.set_box_aspect(high - low, zoom=0.85)
     axes.locator_params(nbins=4)
     for axis, start, end in zip((axes.xaxis, axes.yaxis, axes.zaxis), low, high, strict=True):
-        if end - start < 0.2 * (high - low).max():  # no room for more than one number
+        if end - start < 0.2 * (high - low).max():  # space for one label only
             axis.set_ticks([float(f"{(start + end) / 2:.3g}")])
     elevation, azimuth = (25.0, -60.0) if view is None else view
     axes.view_init(elevation, azimuth)
@@ -428,7 +419,7 @@ def made_axes(
 
 
 def polygons(corners: Array, faces: Any, edges: str, width: float) -> Any:
-    """Cells in the plane or facets in space."""
+    """Return a collection of cells in the plane or facets in space."""
     from matplotlib.collections import PolyCollection
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
@@ -436,8 +427,8 @@ def polygons(corners: Array, faces: Any, edges: str, width: float) -> Any:
     return kind(list(corners), facecolors=faces, edgecolors=edges, linewidths=width)
 
 
-def on_surface(facets: Array, colours: Any) -> Any:
-    """Facets of Γc with a colour each: lines in the plane."""
+def facet_collection(facets: Array, colours: Any) -> Any:
+    """Return a collection of facets of Γc, with one colour each; lines in the plane."""
     from matplotlib.collections import LineCollection
 
     if facets.shape[2] == 3:
@@ -446,19 +437,19 @@ def on_surface(facets: Array, colours: Any) -> Any:
 
 
 def status_colours(status: npt.NDArray[Any]) -> list[str]:
-    """Of facets that are open, stick or slip."""
-    return [_STATUS[Status(each)][1] for each in status]
+    """Return the colours of facets by their contact status."""
+    return [_STATUS[Status(value)][1] for value in status]
 
 
-def status_patches() -> list[Any]:
-    """Entries of a legend for them."""
+def status_handles() -> list[Any]:
+    """Return legend handles for the contact status."""
     from matplotlib.patches import Patch
 
     return [Patch(fc=colour, ec="#555555", label=name) for name, colour in _STATUS.values()]
 
 
-def scale_of(low: float, high: float) -> Any:
-    """Colours of values from ``low`` to ``high``, for faces and for a bar."""
+def colour_scale(low: float, high: float) -> Any:
+    """Return the colour scale of values from ``low`` to ``high``, for faces and colour bars."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
@@ -466,7 +457,7 @@ def scale_of(low: float, high: float) -> Any:
 
 
 def save(figure: Any, path: str | os.PathLike[str]) -> None:
-    """Write a figure; the file is complete or as before."""
+    """Write a figure atomically, and close it."""
     try:
         with files.atomic_write(path) as temporary:
             figure.savefig(temporary, dpi=150)
@@ -475,7 +466,7 @@ def save(figure: Any, path: str | os.PathLike[str]) -> None:
 
 
 def pyplot() -> Any:
-    """Import pyplot when a picture is drawn: importing the package stays cheap."""
+    """Import and return pyplot, without a display; late, to keep the import of the package fast."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,4 +1,4 @@
-"""Values at nodes and in cells, comparison with references, and JSON files."""
+"""Values at nodes and quadrature points, comparison with references, and JSON files."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def sample(expression: Any, mesh: dolfinx.mesh.Mesh, degree: int = 1) -> tuple[A
     points, _ = basix.make_quadrature(mesh.basix_cell(), degree)
     cells = np.arange(mesh.topology.index_map(mesh.topology.dim).size_local, dtype=np.int32)
     gdim, shape = mesh.geometry.dim, expression.ufl_shape
-    n = len(cells) * len(points)  # none on a rank without cells
+    n = len(cells) * len(points)
     columns = [
         np.reshape(compile_expression(e, points).eval(mesh, cells), (n, math.prod(e.ufl_shape)))
         for e in (ufl.SpatialCoordinate(mesh), expression)

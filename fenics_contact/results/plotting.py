@@ -30,10 +30,10 @@ __all__ = [
     "plot_tractions",
 ]
 
-# Fields of `plot_field` and what their colours are called; units are of stress or of length.
+# Labels and kinds of units of the fields of `plot_field`.
 _FIELDS = {
     "pressure": ("contact pressure", "stress"),
-    "friction": ("size of the tangential traction", "stress"),
+    "friction": ("magnitude of the tangential traction", "stress"),
     "gap": ("gap", "length"),
     "slip": ("accumulated slip", "length"),
 }
@@ -72,12 +72,12 @@ def plot_deformation(
         ValueError: u is no displacement, or the stress has another shape; raised on all ranks.
         OSError: The file cannot be written and is unchanged; raised on all ranks.
     """
-    shape = drawing.ShapeOf(u, stress)()
+    shape = drawing.ShapeEvaluator(u, stress)()
     contacts = listed("contacts", contacts, Contact)
     with collective_errors(u.function_space.mesh.comm):
         if shape is not None:
             obstacles, units = shapes_of(contacts), (unit, stress_unit)
-            figure = drawing.deformed(shape, units, title, magnification, obstacles, view)
+            figure = drawing.draw_deformation(shape, units, title, magnification, obstacles, view)
             drawing.save(figure, path)
 
 
@@ -121,32 +121,32 @@ def plot_field(
     at_points = _field(contact, field)
     rows = contact.quadrature.point_rows
     values, weights = at_points[rows], contact.quadrature.weights[rows]
-    known = np.isfinite(values)
-    total = np.sum(weights * known, axis=1)
-    means = np.sum(weights * np.where(known, values, 0.0), axis=1)
+    is_known = np.isfinite(values)
+    total = np.sum(weights * is_known, axis=1)
+    means = np.sum(weights * np.where(is_known, values, 0.0), axis=1)
     means = np.divide(means, total, out=np.full_like(total, np.nan), where=total > 0)
-    drawn = drawing.surface_of(contact, means, magnification)
+    surface = drawing.gather_surface(contact, means, magnification)
     with collective_errors(contact.surface.mesh.comm):
-        if drawn is None:
+        if surface is None:
             return
-        drawn = drawn.around(near)
-        figure, axes, handles = drawn.axes(length, title, view, contact, magnification)
+        surface = surface.crop(near)
+        figure, axes, handles = surface.create_axes(length, title, view, contact, magnification)
         from matplotlib.colors import to_rgba
         from matplotlib.patches import Patch
 
-        means = drawn.values
+        means = surface.values
         low, high = (end(means, initial=0.0) for end in (np.nanmin, np.nanmax))
-        colours = drawing.scale_of(low, high)
+        colours = drawing.colour_scale(low, high)
         faces = colours.to_rgba(means)
-        grey, none = to_rgba(drawing.COLOURS["open"]), np.isnan(means)
-        none |= (means == 0.0) & (field != "gap")
-        faces[none] = grey
-        axes.add_collection(drawing.on_surface(drawn.facets, faces))
+        grey, is_grey = to_rgba(drawing.COLOURS["open"]), np.isnan(means)
+        is_grey |= (means == 0.0) & (field != "gap")
+        faces[is_grey] = grey
+        axes.add_collection(drawing.facet_collection(surface.facets, faces))
         name, kind = _FIELDS[field]
         unit = {"stress": stress, "length": length}[kind]
         figure.colorbar(colours, ax=axes, label=f"{name} [{unit}]", shrink=0.8)
-        if none.any():
-            label = "gap not known" if field == "gap" else f"no {field}"
+        if is_grey.any():
+            label = "gap unknown" if field == "gap" else f"no {field}"
             handles.append(Patch(fc=grey, ec="#555555", label=label))
         if handles:
             figure.legend(handles=handles, loc="outside lower center", ncols=2)
@@ -154,7 +154,7 @@ def plot_field(
 
 
 def _field(contact: Contact, name: str) -> Array:
-    """One of `_FIELDS` at this rank's points."""
+    """Return one of `_FIELDS` at this rank's points."""
     if name == "pressure":
         return contact.pressure
     if name == "friction":
@@ -201,15 +201,15 @@ def plot_status(
         ValueError: ``near`` is no length; raised on all ranks.
     """
     drawing.check_near(near)
-    drawn = drawing.surface_of(contact, facet_status(contact), magnification)
+    surface = drawing.gather_surface(contact, facet_status(contact), magnification)
     with collective_errors(contact.surface.mesh.comm):
-        if drawn is None:
+        if surface is None:
             return
-        drawn = drawn.around(near)
-        figure, axes, handles = drawn.axes(length, title, view, contact, magnification)
-        colours = drawing.status_colours(drawn.values)
-        axes.add_collection(drawing.on_surface(drawn.facets, colours))
-        handles = [*drawing.status_patches(), *handles]
+        surface = surface.crop(near)
+        figure, axes, handles = surface.create_axes(length, title, view, contact, magnification)
+        colours = drawing.status_colours(surface.values)
+        axes.add_collection(drawing.facet_collection(surface.facets, colours))
+        handles = [*drawing.status_handles(), *handles]
         figure.legend(handles=handles, loc="outside lower center", ncols=4)
         drawing.save(figure, path)
 
@@ -240,11 +240,10 @@ def plot_tractions(
     plt = drawing.pyplot()
     figure, axes = plt.subplots(figsize=(7.6, 4.8), layout="constrained")
     x, status = points["x"][:, 0], points["status"]
-    closed = status != Status.OPEN
-    # Somewhat beyond the contact, but not beyond Γc.
-    reach = min(1.15 * np.abs(x[closed]).max(initial=0.0), np.abs(x).max(initial=0.0)) or 1.0
-    near = np.abs(x) <= reach
-    # The shear on the body, along x: the direction in which the obstacle holds it.
+    in_contact = status != Status.OPEN
+    # 15 % beyond the contact, but not beyond Γc.
+    limit = min(1.15 * np.abs(x[in_contact]).max(initial=0.0), np.abs(x).max(initial=0.0)) or 1.0
+    near = np.abs(x) <= limit
     shear = np.abs(points["tangential_traction"][:, 0])
     _draw_tractions(axes, x, points["pressure"], shear, status, [near])
     styles = ("--", ":", "-.")
@@ -255,7 +254,7 @@ def plot_tractions(
     for i, (label, value) in enumerate((marks or {}).items()):
         axes.axvline(value, color="#2a8a3a", linewidth=0.9, linestyle=styles[i % 3], label=label)
     axes.set(xlabel=f"x [{length}]", ylabel=f"traction [{stress}]", title=title)
-    axes.set_xlim(left=min(0.0, float(x.min())) if x.min() >= 0 else -reach, right=reach)
+    axes.set_xlim(left=min(0.0, float(x.min())) if x.min() >= 0 else -limit, right=limit)
     axes.set_ylim(bottom=0.0)
     axes.grid(alpha=0.25)
     axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -289,11 +288,11 @@ def plot_along(
     """
     if contact.points.shape[1] != 2:
         raise ValueError(f"{contact.name}: plot_along needs a plane body; in space use plot_field")
-    found = along(contact, length)
+    curve_data = along(contact, length)
     with collective_errors(contact.surface.mesh.comm):
-        if found is None:
+        if curve_data is None:
             return
-        plt, x, values = drawing.pyplot(), found.abscissa, found.values
+        plt, x, values = drawing.pyplot(), curve_data.abscissa, curve_data.values
         lower = {"gap": ("gap", "pressure")}
         if np.any(values["slip"]):
             lower["slip"] = ("accumulated slip", "tangential")
@@ -305,44 +304,44 @@ def plot_along(
             layout="constrained",
         )
         _draw_tractions(
-            rows[0], x, values["pressure"], values["friction"], values["status"], found.curves
+            rows[0], x, values["pressure"], values["friction"], values["status"], curve_data.curves
         )
         rows[0].set(ylabel=f"traction [{stress}]", title=title)
         for axes, (name, (label, colour)) in zip(rows[1:], lower.items(), strict=True):
-            for curve in found.curves:
+            for curve in curve_data.curves:
                 style = {"color": drawing.COLOURS[colour], "label": label}
                 axes.plot(x[curve], values[name][curve], ".-", **style)
             axes.set(ylabel=f"{label} [{length}]")
-        rows[-1].set(xlabel=found.label)
-        if found.is_angle:
+        rows[-1].set(xlabel=curve_data.label)
+        if curve_data.is_angle:
             rows[-1].locator_params(axis="x", steps=[1, 1.5, 3, 4.5, 9, 10])
         rows[0].legend(fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
         for axes in rows:
-            axes.axhline(0.0, color="#555555", linewidth=0.6)  # lest round-off fill the picture
+            axes.axhline(0.0, color="#555555", linewidth=0.6)  # keeps round-off out of the limits
             axes.grid(alpha=0.25)
         drawing.save(figure, path)
 
 
 def _draw_tractions(
-    axes: Any, x: Array, pressure: Array, shear: Array, status: Array, sides: Sequence[Mask]
+    axes: Any, x: Array, pressure: Array, shear: Array, status: Array, parts: Sequence[Mask]
 ) -> None:
-    """Curves of pressure and shear, with what sticks and slips; of several sides of Γc."""
+    """Draw pressure, shear, and sticking and slipping points, on several parts of Γc."""
     blue, red = drawing.COLOURS["pressure"], drawing.COLOURS["tangential"]
-    labels = True
-    for side in sides:
-        curves = [(pressure, ".-", blue, "pressure", side)]
+    has_labels = True
+    for part in parts:
+        curves = [(pressure, ".-", blue, "pressure", part)]
         if np.any(shear):
-            curves.append((shear, "-", red, "|tangential traction|", side))
+            curves.append((shear, "-", red, "|tangential traction|", part))
             for state, marker, name in (
                 (Status.STICK, "o", "sticking points"),
                 (Status.SLIP, "x", "slipping points"),
             ):
-                curves.append((shear, marker, red, name, side & (status == state)))
-        for values, style, colour, label, mask in curves:
-            told = label if labels else None
+                curves.append((shear, marker, red, name, part & (status == state)))
+        for values, style, colour, name, mask in curves:
+            label = name if has_labels else None
             size = 4 if values is shear else 6
-            axes.plot(x[mask], values[mask], style, color=colour, markersize=size, label=told)
-        labels = False
+            axes.plot(x[mask], values[mask], style, color=colour, markersize=size, label=label)
+        has_labels = False
 
 
 @contextmanager
@@ -360,11 +359,9 @@ def figure(
         The axes, or an array of axes if there are several.
     """
     plt = drawing.pyplot()
-    drawn, axes = plt.subplots(
-        1, columns, figsize=(columns * size[0], size[1]), layout="constrained"
-    )
+    fig, axes = plt.subplots(1, columns, figsize=(columns * size[0], size[1]), layout="constrained")
     try:
         yield axes
-        drawing.save(drawn, path)
+        drawing.save(fig, path)
     finally:
-        plt.close(drawn)
+        plt.close(fig)

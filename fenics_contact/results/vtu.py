@@ -1,9 +1,7 @@
-"""Files of the Visualization Toolkit (VTK), which ParaView reads: grids, and series of them.
+"""VTK files for ParaView: unstructured grids (``.vtu``) and time series of them (``.pvd``).
 
-A grid is an XML file of unstructured cells (``.vtu``), its arrays in base64; a series is a list of
-such files with their times (``.pvd``). Cells share no nodes, so that fields may jump between them.
-On the calling rank only. DOLFINx's writers take functions on a mesh, and here are values at
-quadrature points and on facets.
+Arrays are in base64. Cells share no nodes, so that fields may be discontinuous. Unlike DOLFINx's
+writers these functions take values at quadrature points and on facets. On the calling rank only.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from fenics_contact.types import Array
 __all__ = ["CELLS", "Grid", "nodes", "read_series", "write_grid", "write_series"]
 
 
-# VTK's numbers of cells of degree 1 and 2, by DOLFINx's names.
+# VTK cell types of degree 1 and 2, by DOLFINx's names of cells.
 CELLS = {
     "point": (1, 1),
     "interval": (3, 21),
@@ -39,23 +37,23 @@ CELLS = {
 
 
 def nodes(cell: str, degree: int) -> Array:
-    """Reference coordinates of a cell's nodes of degree 1 or 2 in VTK's order, (n_nodes, d)."""
+    """Return the reference nodes of a cell of degree 1 or 2 in VTK's order, (n_nodes, d)."""
     kind, equispaced = basix.CellType[cell], basix.LagrangeVariant.equispaced
-    places = basix.create_element(basix.ElementFamily.P, kind, degree, equispaced).points
-    order = dolfinx.io.utils.cell_perm_vtk(dolfinx.mesh.CellType[cell], len(places))
-    return np.asarray(places[np.argsort(order)], dtype=np.float64)
+    x = basix.create_element(basix.ElementFamily.P, kind, degree, equispaced).points
+    order = dolfinx.io.utils.cell_perm_vtk(dolfinx.mesh.CellType[cell], len(x))
+    return np.asarray(x[np.argsort(order)], dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Cells of one kind, each with nodes of its own.
+    """Cells of one type, which share no nodes.
 
     Attributes:
-        kind: VTK's number of the kind.
-        points: Places of the nodes, (n_cells, n_nodes, d).
-        at_nodes: Fields at the nodes by name, (n_cells, n_nodes, …).
-        in_cells: Fields in the cells by name, (n_cells, …).
-        numbers: Of the whole, by name.
+        kind: VTK cell type.
+        points: Coordinates of the nodes, (n_cells, n_nodes, d).
+        at_nodes: Nodal fields by name, (n_cells, n_nodes, …).
+        in_cells: Cell fields by name, (n_cells, …).
+        numbers: Global numbers by name (field data).
     """
 
     kind: int
@@ -66,10 +64,10 @@ class Grid:
 
 
 def write_grid(path: Path, grid: Grid) -> None:
-    """Write a ``.vtu`` file. Vectors and tensors in the plane get the rows they lack, zero.
+    """Write a ``.vtu`` file. Vectors and tensors in the plane are extended by zeros.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     n_cells, n_nodes = grid.points.shape[:2]
     n = n_cells * n_nodes
@@ -78,18 +76,18 @@ def write_grid(path: Path, grid: Grid) -> None:
         "offsets": np.arange(1, n_cells + 1, dtype=np.int64) * n_nodes,
         "types": np.full(n_cells, grid.kind, dtype=np.uint8),
     }
-    at_nodes = {name: _rows(values, 2) for name, values in grid.at_nodes.items()}
-    in_cells = {name: _rows(values, 1) for name, values in grid.in_cells.items()}
+    at_nodes = {name: _to_rows(values, 2) for name, values in grid.at_nodes.items()}
+    in_cells = {name: _to_rows(values, 1) for name, values in grid.in_cells.items()}
     with open(path, "w", encoding="ascii", errors="xmlcharrefreplace") as file:
         file.write('<?xml version="1.0"?>\n<VTKFile type="UnstructuredGrid" version="1.0" ')
         file.write('byte_order="LittleEndian" header_type="UInt64">\n<UnstructuredGrid>\n')
         file.write("<FieldData>\n")
         for name, number in grid.numbers.items():
-            file.write(_array(name, np.array([number]), ' NumberOfTuples="1"'))
+            file.write(_format_array(name, np.array([number]), ' NumberOfTuples="1"'))
         file.write("</FieldData>\n")
         file.write(f'<Piece NumberOfPoints="{n}" NumberOfCells="{n_cells}">\n')
         sections: dict[str, Mapping[str, npt.NDArray[Any]]] = {
-            "Points": {"points": _rows(grid.points, 2)},
+            "Points": {"points": _to_rows(grid.points, 2)},
             "Cells": topology,
             "PointData": at_nodes,
             "CellData": in_cells,
@@ -97,16 +95,16 @@ def write_grid(path: Path, grid: Grid) -> None:
         for section, arrays in sections.items():
             file.write(f"<{section}>\n")
             for name, values in arrays.items():
-                file.write(_array(name, values))
+                file.write(_format_array(name, values))
             file.write(f"</{section}>\n")
         file.write("</Piece>\n</UnstructuredGrid>\n</VTKFile>\n")
 
 
 def write_series(path: Path, states: list[tuple[float, str]]) -> None:
-    """Write a ``.pvd`` file: the times, and the names of the files beside it.
+    """Write a ``.pvd`` file with times and names of files in the same folder.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     lines = [
         f'<DataSet timestep="{time!r}" part="0" file={quoteattr(name)}/>' for time, name in states
@@ -116,11 +114,11 @@ def write_series(path: Path, states: list[tuple[float, str]]) -> None:
 
 
 def read_series(path: Path) -> list[tuple[float, str]]:
-    """Times and names of files of a ``.pvd`` file; none if it is not there.
+    """Read times and names of files from a ``.pvd`` file; empty if it does not exist.
 
     Raises:
-        ValueError: It is none of `write_series`.
-        OSError: It cannot be read.
+        ValueError: The file is damaged, or was not written by `write_series`.
+        OSError: The file cannot be read.
     """
     if not path.exists():
         return []
@@ -133,20 +131,20 @@ def read_series(path: Path) -> list[tuple[float, str]]:
         ) from None
 
 
-def _rows(values: npt.NDArray[Any], axes: int) -> npt.NDArray[Any]:
-    """Fields as rows of 1, 3 or 9 numbers; the first axes count the rows."""
+def _to_rows(values: npt.NDArray[Any], axes: int) -> npt.NDArray[Any]:
+    """Flatten the first axes, and pad scalars, vectors or tensors to 1, 3 or 9 numbers per row."""
     values = np.reshape(values, (-1, *values.shape[axes:]))
     missing = [(0, 0)] + [(0, 3 - size) for size in values.shape[1:]]
     return np.pad(values, missing).reshape(len(values), 3 ** (values.ndim - 1))
 
 
-def _array(name: str, values: npt.NDArray[Any], more: str = "") -> str:
-    """One array as XML: its length in bytes and its bytes, in base64."""
+def _format_array(name: str, values: npt.NDArray[Any], attributes: str = "") -> str:
+    """Return an array as XML: its length in bytes and its bytes, in base64."""
     values = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<"))
     kind = {"f": "Float", "i": "Int", "u": "UInt"}[values.dtype.kind] + str(8 * values.itemsize)
     size = values.shape[1] if values.ndim > 1 else 1
     data = np.uint64(values.nbytes).astype("<u8").tobytes() + values.tobytes()
     return (
-        f'<DataArray type="{kind}" Name={quoteattr(name)} NumberOfComponents="{size}"{more} '
+        f'<DataArray type="{kind}" Name={quoteattr(name)} NumberOfComponents="{size}"{attributes} '
         f'format="binary">{base64.b64encode(data).decode()}</DataArray>\n'
     )

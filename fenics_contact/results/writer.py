@@ -32,8 +32,8 @@ from fenics_contact.types import Array
 
 __all__ = ["Writer", "facet_status"]
 
-# Of the size of the body, how far beyond it obstacles are written.
-_ABOUT = 0.1
+# Obstacles are written up to this distance from the body, relative to its size.
+_OBSTACLE_MARGIN_RATIO = 0.1
 
 
 class Writer:
@@ -84,8 +84,8 @@ class Writer:
         self._body = _Body(problem, stress)
         self._surfaces = [_Surface(contact) for contact in problem.contacts]
         names = [series for s in self._surfaces for series in s.series]
-        known = [c for c in problem.contacts if ObstacleShape.is_known(c)]
-        names += [f"{contact.name}_obstacle" for contact in known]
+        with_obstacle = [c for c in problem.contacts if ObstacleShape.is_known(c)]
+        names += [f"{contact.name}_obstacle" for contact in with_obstacle]
         for name in names:
             if not re.fullmatch(r"[\w. +-]+", name) or [*names, "body"].count(name) > 1:
                 raise ValueError(
@@ -96,7 +96,7 @@ class Writer:
         self._obstacles: dict[str, ObstacleShape] = {}  # on the first rank
         with collective_errors(self._comm):
             if self._comm.rank == 0:
-                self._obstacles = {f"{c.name}_obstacle": ObstacleShape(c) for c in known}
+                self._obstacles = {f"{c.name}_obstacle": ObstacleShape(c) for c in with_obstacle}
                 files.make_folder(self.folder)
                 for name in ("body", *names):
                     self._series[name] = vtu.read_series(self._path(name))
@@ -137,38 +137,38 @@ class Writer:
         grids = {"body": self._body.grid()}
         for surface in self._surfaces:
             grids |= dict(zip(surface.series, surface.grids(), strict=True))
-        # The ranks' cells one after another, on the first rank.
-        whole = {name: _gathered(self._comm, grid) for name, grid in grids.items()}
+        gathered = {name: _gather(self._comm, grid) for name, grid in grids.items()}
         with collective_errors(self._comm):
             if self._comm.rank == 0:
-                whole |= self._obstacle_grids(whole["body"])
-                self._put(time, {name: replace(g, numbers=numbers) for name, g in whole.items()})
+                gathered |= self._obstacle_grids(gathered["body"])
+                states = {name: replace(g, numbers=numbers) for name, g in gathered.items()}
+                self._write_grids(time, states)
         self._last = time
 
     def _obstacle_grids(self, body: vtu.Grid) -> dict[str, vtu.Grid]:
-        """Surfaces of the rigid obstacles about the body, deformed or not. On the first rank."""
+        """Return surfaces of the rigid obstacles near the body. On the first rank."""
         x = body.points
-        box = box_about(np.stack([x, x + body.at_nodes["displacement"]]), _ABOUT)
+        box = box_about(np.stack([x, x + body.at_nodes["displacement"]]), _OBSTACLE_MARGIN_RATIO)
         kind = vtu.CELLS["interval" if x.shape[2] == 2 else "triangle"][0]
         return {name: vtu.Grid(kind, shape(box)) for name, shape in self._obstacles.items()}
 
     def _path(self, name: str) -> Path:
         return self.folder / f"{name}.pvd"
 
-    def _put(self, time: float, grids: dict[str, vtu.Grid]) -> None:
-        """Write the grids, and the lists that name them. On the first rank."""
+    def _write_grids(self, time: float, grids: dict[str, vtu.Grid]) -> None:
+        """Write the grids and the updated series. On the first rank."""
         for name in grids:
             if vtu.read_series(self._path(name)) != self._series[name]:
                 raise ValueError(
                     f"{self._path(name)} has changed since this Writer wrote or read it: another "
                     "one writes to this folder; use one Writer per folder"
                 )
-        states, dropped = {}, []
-        with contextlib.ExitStack() as stack:  # in place when all are written, the lists at last
+        states, obsolete = {}, []
+        with contextlib.ExitStack() as stack:  # replaces files when all are written, series last
             for name in grids:
-                kept = [state for state in self._series[name] if state[0] < time]
-                states[name] = [*kept, (time, f"{name}_{len(kept):04d}.vtu")]
-                dropped += [file for _, file in self._series[name][len(kept) + 1 :]]
+                earlier = [state for state in self._series[name] if state[0] < time]
+                states[name] = [*earlier, (time, f"{name}_{len(earlier):04d}.vtu")]
+                obsolete += [file for _, file in self._series[name][len(earlier) + 1 :]]
                 vtu.write_series(
                     stack.enter_context(files.atomic_write(self._path(name))), states[name]
                 )
@@ -176,12 +176,12 @@ class Writer:
                 path = self.folder / states[name][-1][1]
                 vtu.write_grid(stack.enter_context(files.atomic_write(path)), grid)
         self._series = states
-        for file in dropped:
+        for file in obsolete:
             (self.folder / Path(file).name).unlink(missing_ok=True)
 
 
 class _Body:
-    """The cells of the body and what is written of them. The constructor is collective."""
+    """Grid of the body with displacement and stress. The constructor is collective."""
 
     def __init__(self, problem: ContactProblem, stress: Any) -> None:
         self._displacement = problem.displacement
@@ -189,11 +189,11 @@ class _Body:
         d, name = mesh.geometry.dim, mesh.topology.cell_name()
         kind, degree = basix.CellType[name], problem.displacement.degree
         order = min(degree, 2)
-        self._number = vtu.CELLS[name][order - 1]
+        self._cell_type = vtu.CELLS[name][order - 1]
         nodes = vtu.nodes(name, order)
-        places = ufl.SpatialCoordinate(mesh), problem.displacement.expression
-        parts = [e[i] for e in places for i in range(d)]
-        self._n_nodes, self._places = len(nodes), compile_expression(ufl.as_vector(parts), nodes)
+        vectors = ufl.SpatialCoordinate(mesh), problem.displacement.expression
+        parts = [e[i] for e in vectors for i in range(d)]
+        self._n_nodes, self._motion = len(nodes), compile_expression(ufl.as_vector(parts), nodes)
         self._stress: fem.Expression | None = None
         if stress is None:
             return
@@ -202,7 +202,7 @@ class _Body:
             raise ValueError(
                 f"stress has shape {stress.ufl_shape}; it must be ({d}, {d}) or (3, 3)"
             )
-        # Points inside the cells: on an axis, or at a tip, the stress may have no value.
+        # Interior points: the stress may be undefined on an axis or at a tip.
         inside = basix.create_element(
             basix.ElementFamily.P,
             kind,
@@ -215,11 +215,11 @@ class _Body:
         self._stress = compile_expression(stress, inside.points)
 
     def grid(self) -> vtu.Grid:
-        """The cells of this rank as they are now."""
+        """Return the present grid of this rank's cells."""
         mesh, d = self._mesh, self._mesh.geometry.dim
         cells = np.arange(mesh.topology.index_map(mesh.topology.dim).size_local, dtype=np.int32)
-        places = self._places.eval(mesh, cells).reshape(len(cells), self._n_nodes, 2 * d)
-        fields = {"displacement": places[:, :, d:]}
+        motion = self._motion.eval(mesh, cells).reshape(len(cells), self._n_nodes, 2 * d)
+        fields = {"displacement": motion[:, :, d:]}
         if self._stress is not None:
             inside = self._stress.eval(mesh, cells).reshape(
                 len(cells), self._basis.shape[1], *self._shape
@@ -228,14 +228,14 @@ class _Body:
             fields["stress"] = stress
             if self._shape == (3, 3):
                 fields["von_mises"] = von_mises(stress)
-        return vtu.Grid(self._number, places[:, :, :d], fields)
+        return vtu.Grid(self._cell_type, motion[:, :, :d], fields)
 
 
 class _Surface:
-    """Γc of a contact and what is written of it. The constructor is collective.
+    """Grids of Γc and of its quadrature points. The constructor is collective.
 
     Attributes:
-        series: Names of its two series.
+        series: Names of the two series.
     """
 
     def __init__(self, contact: Contact) -> None:
@@ -246,47 +246,47 @@ class _Surface:
         facets = FacetSet(self._u.function_space, surface.facets)
         name = surface.submesh.topology.cell_name()
         order = min(displacement.degree, 2)
-        self._number = vtu.CELLS[name][order - 1]
+        self._cell_type = vtu.CELLS[name][order - 1]
         nodes = vtu.nodes(name, order)
-        every = np.arange(len(surface.facets))
-        self._facets, self._shape = facets, (len(every), len(nodes), surface.mesh.geometry.dim)
-        self._where = np.repeat(every, len(nodes)), np.tile(nodes, (len(every), 1))
+        n = len(surface.facets)
+        self._facets, self._shape = facets, (n, len(nodes), surface.mesh.geometry.dim)
+        self._nodes = np.repeat(np.arange(n), len(nodes)), np.tile(nodes, (n, 1))
         self._rows = contact.quadrature.point_rows
 
     def grids(self) -> tuple[vtu.Grid, vtu.Grid]:
-        """This rank's facets and points as they are now. Collective."""
+        """Return the present grids of this rank's facets and points. Collective."""
         contact, rows = self._contact, self._rows
         contact.displacement.follow()
-        places, _ = self._facets.positions(*self._where)
-        moved, _ = self._facets.positions(*self._where, self._u)
-        nodes = places.reshape(self._shape)
+        x, _ = self._facets.positions(*self._nodes)
+        x_deformed, _ = self._facets.positions(*self._nodes, self._u)
+        nodes = x.reshape(self._shape)
         at_points = self._values()
         measure = contact.quadrature.weights[rows]
         at_nodes = {
             name: facet_values(contact.points[rows], measure, values[rows], nodes)
             for name, values in at_points.items()
         }
-        at_nodes = {"displacement": (moved - places).reshape(self._shape)} | at_nodes
+        at_nodes = {"displacement": (x_deformed - x).reshape(self._shape)} | at_nodes
         in_facets: dict[str, npt.NDArray[Any]] = {"status": facet_status(contact)}
-        moves = {"displacement": contact.own_displacement()}
-        all_points: dict[str, npt.NDArray[Any]] = {**moves, **at_points, "status": contact.status}
+        fields: dict[str, npt.NDArray[Any]] = {"displacement": contact.own_displacement()}
+        fields |= {**at_points, "status": contact.status}
         if not contact.rigid:
             in_facets["paired"] = np.mean(contact.paired[rows], axis=1)
-            all_points["paired"] = contact.paired.astype(np.float64)
-        order = np.ravel(rows)  # facet by facet, as the facets
-        points = {name: values[order][:, None] for name, values in all_points.items()}
+            fields["paired"] = contact.paired.astype(np.float64)
+        order = np.ravel(rows)  # facet by facet
+        points = {name: values[order][:, None] for name, values in fields.items()}
         return (
-            vtu.Grid(self._number, nodes, at_nodes, in_facets),
+            vtu.Grid(self._cell_type, nodes, at_nodes, in_facets),
             vtu.Grid(vtu.CELLS["point"][0], contact.points[order][:, None], points),
         )
 
     def _values(self) -> dict[str, Array]:
-        """What is known at the points, by name. Collective."""
+        """Return the values at the points, by name. Collective."""
         contact = self._contact
-        found = {"pressure": contact.pressure + 0.0}  # no -0
+        values = {"pressure": contact.pressure + 0.0}  # no -0
         if contact.finite:
-            found["true_pressure"] = contact.pressure / contact.area_stretch()
-        return found | {
+            values["true_pressure"] = contact.pressure / contact.area_stretch()
+        return values | {
             "tangential_traction": contact.tangential_traction,
             "gap": contact.gap,
             "slip": contact.slip.sum(axis=1),
@@ -295,18 +295,18 @@ class _Surface:
 
 
 def facet_status(contact: Contact) -> npt.NDArray[np.int8]:
-    """`Status` of most of the points of every facet of this rank, (n_facets,)."""
+    """Return the `Status` of most of the points of every facet of this rank, (n_facets,)."""
     status = contact.status[contact.quadrature.point_rows]
     return np.stack([np.sum(status == s, axis=1) for s in Status]).argmax(axis=0).astype(np.int8)
 
 
-def _gathered(comm: MPI.Comm, grid: vtu.Grid) -> vtu.Grid:
-    """The cells of all ranks, one after another, on the first one; else this rank's. Collective."""
+def _gather(comm: MPI.Comm, grid: vtu.Grid) -> vtu.Grid:
+    """Return the grid of all ranks on the first one, this rank's on the others. Collective."""
     rows = grid.points, *grid.at_nodes.values(), *grid.in_cells.values()
-    whole = gather_on_first(comm, *rows)
-    if whole is None:
+    gathered = gather_on_first(comm, *rows)
+    if gathered is None:
         return grid
-    points, *fields = whole
+    points, *fields = gathered
     at_nodes = dict(zip(grid.at_nodes, fields, strict=False))
     in_cells = dict(zip(grid.in_cells, fields[len(at_nodes) :], strict=True))
     return replace(grid, points=points, at_nodes=at_nodes, in_cells=in_cells)
