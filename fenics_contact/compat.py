@@ -54,11 +54,7 @@ NOT_FINITE = int(
 def create_facet_submesh(
     mesh: dolfinx.mesh.Mesh, facets: npt.NDArray[np.int32]
 ) -> tuple[dolfinx.mesh.Mesh, Any, npt.NDArray[np.int32]]:
-    """Create a submesh of facets of ``mesh``. Collective.
-
-    Args:
-        mesh: The parent mesh.
-        facets: Facets of this rank (local indices), shape (n_facets,).
+    """Create a submesh of facets of this rank (local indices), shape (n_facets,). Collective.
 
     Returns:
         The submesh; its ``entity_maps`` for ``dolfinx.fem.form``; and the parent facet of each
@@ -99,14 +95,9 @@ def option_was_read(name: str) -> bool:
 def sparse_matrix(
     comm: MPI.Comm, n_columns: int, pointers: Any, columns: Any, values: Array
 ) -> PETSc.Mat:
-    """Create a sparse matrix from this rank's rows in CSR format. Collective.
+    """Create a sparse matrix from this rank's rows in CSR format, with global columns. Collective.
 
-    Args:
-        comm: Communicator of the matrix.
-        n_columns: Number of columns owned by this rank.
-        pointers: CSR row pointers, (n_rows + 1,).
-        columns: Global columns of the entries, (n_entries,).
-        values: The entries, (n_entries,).
+    ``n_columns`` is the number of columns that this rank owns.
     """
     csr = *(np.asarray(numbers, dtype=PETSc.IntType) for numbers in (pointers, columns)), values
     return PETSc.Mat().createAIJ(((len(pointers) - 1, None), (n_columns, None)), csr=csr, comm=comm)

@@ -30,10 +30,9 @@ _CACHE_HIT_SECONDS, _MESSAGE_SECONDS = 0.1, 3.0
 
 
 def compile_form(form: ufl.Form, entity_maps: Any = None) -> fem.Form:
-    """Compile a UFL form with the entity maps of its submeshes, or load it from the cache.
+    """Compile a UFL form, or load it from DOLFINx's cache. Collective.
 
-    Collective. If compilation takes more than some seconds in total, a message is shown once, in
-    the log at level INFO or else on a terminal.
+    A message is shown once, in the log (INFO) or on a terminal, if compilation takes long.
     """
     start = time.perf_counter()
     compiled = fem.form(form, entity_maps=entity_maps or None)

@@ -223,10 +223,7 @@ def _check_compatible(names: Sequence[Hashable], meshes: Sequence[dolfinx.mesh.M
 
 
 def _cells_and_nodes(meshes: Sequence[dolfinx.mesh.Mesh]) -> tuple[Index, Array]:
-    """Return this rank's cells by global node numbers of the joined mesh, and its nodes.
-
-    Collective.
-    """
+    """Return owned cells by global node numbers of the joined mesh, and owned nodes. Collective."""
     comm, d = meshes[0].comm, meshes[0].geometry.dim
     maps = [mesh.geometry.index_map() for mesh in meshes]
     n_own = np.array([nodes.size_local for nodes in maps])
@@ -250,11 +247,9 @@ def _cells_and_nodes(meshes: Sequence[dolfinx.mesh.Mesh]) -> tuple[Index, Array]
 def _renumber_tags(
     names: Sequence[Hashable], bodies: Sequence[Body]
 ) -> tuple[TagNumbers, TagNumbers, Any]:
-    """Renumber cell and facet tags. Collective.
+    """Renumber cell and facet tags; also return the new tags of owned cells. Collective.
 
-    Returns:
-        New cell tags, new facet tags, and for every owned cell its tag, followed by the tag of each
-        of its facets or zero, (n_cells, 1 + n_facets).
+    These are the tag of each cell and of its facets, or zero, (n_cells, 1 + n_facets).
     """
     cell_numbers: dict[Hashable, dict[int | None, int]] = {}
     facet_numbers: dict[Hashable, dict[int | None, int]] = {}
@@ -337,12 +332,7 @@ def exchange_rows(comm: MPI.Comm, rows: Any, row_numbers: Index) -> Any:
 
 
 def tag_facets(mesh: dolfinx.mesh.Mesh, tags: Any) -> dolfinx.mesh.MeshTags:
-    """Create facet tags that agree on all ranks that share a facet. Collective.
-
-    Args:
-        mesh: The mesh.
-        tags: Tags of the facets of each cell of this rank, 0 for no tag, (n_cells, n_facets).
-    """
+    """Create facet tags from those of the facets of each cell, (n_cells, n), or 0. Collective."""
     d = mesh.topology.dim
     facets = _cell_facets(mesh)
     values = la.vector(mesh.topology.index_map(d - 1), 2)

@@ -297,8 +297,7 @@ def _to_dolfinx(kind: str, n_nodes: int, order: str) -> Index:
 def _check_jacobians(x: Array, nodes: Index, kind: str, node_order: str) -> None:
     """Raise ValueError for cells without volume or with nodes in another order.
 
-    In a valid cell the Jacobian determinant has the same sign at all vertices, and edge nodes of
-    second-order cells are closer to the midpoint of their edge than its ends.
+    The Jacobian determinant has one sign at all vertices, and edge nodes are near midpoints.
     """
     shape, gdim = basix.CellType[kind], x.shape[1]
     degree = _DEGREES[kind][nodes.shape[1]]
@@ -353,11 +352,8 @@ def _cell_tags(cell_tags: Any, n_cells: int) -> Index:
 def _fill_facet_rows(rows: Index, facets: Any, of_cells: Index, n_points: int) -> list[int]:
     """Write 1 plus the position of its tag into ``rows`` for each tagged facet; return the tags.
 
-    Args:
-        rows: Zeros on entry, shape (n_cells, facets per cell).
-        facets: The argument of `mesh_from_arrays`.
-        of_cells: Vertices of the facets of all cells, shape (n_cells, facets per cell, n_vertices).
-        n_points: Number of points.
+    ``rows`` are zeros on entry, (n_cells, n_facets); ``of_cells`` are the vertices of the facets of
+    all cells, (n_cells, n_facets, n_vertices).
     """
     if facets is None:
         return []

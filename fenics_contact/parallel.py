@@ -67,8 +67,7 @@ def collective_errors(comm: MPI.Comm) -> Iterator[None]:
 
     Raises:
         BaseException: The error of this rank, or else one with the text of the first rank that
-            raised: of the same type for ValueError, TypeError and MemoryError, OSError for its
-            subclasses, RuntimeError for all other types.
+            raised: ValueError, TypeError, MemoryError or OSError if it was one, else RuntimeError.
     """
     if comm.size == 1:
         yield

@@ -36,7 +36,11 @@ def test_a_frame_is_a_state(cell, tmp_path, monkeypatch):
     folder = shared_folder(tmp_path)
     made, sigma = rubbed(cell)
     bodies, colours, axes, figures = [], [], [], []
-    polygons, create_axes, colour_scale = drawing.polygons, drawing.create_axes, drawing.colour_scale
+    polygons, create_axes, colour_scale = (
+        drawing.polygons,
+        drawing.create_axes,
+        drawing.colour_scale,
+    )
 
     def drawn(corners, faces, *rest):
         if not isinstance(faces, str):  # as those of obstacles are

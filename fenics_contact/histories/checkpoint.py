@@ -170,11 +170,7 @@ def load(
 
 
 def check_mismatch(on_mismatch: str) -> None:
-    """Check that ``on_mismatch`` is "refuse" or "continue".
-
-    Raises:
-        ValueError: It is neither.
-    """
+    """Raise ValueError unless ``on_mismatch`` is "refuse" or "continue"."""
     if on_mismatch not in ("refuse", "continue"):
         raise ValueError(f'on_mismatch is {on_mismatch!r}; it must be "refuse" or "continue"')
 
@@ -222,9 +218,7 @@ _problems_with_distinct_nodes: weakref.WeakSet[ContactProblem] = weakref.WeakSet
 
 
 def check_places(problem: ContactProblem) -> None:
-    """Check that the nodes of the mesh can be identified by their coordinates and cells.
-
-    Collective.
+    """Check that nodes can be identified by their coordinates and cells. Collective.
 
     Raises:
         ValueError: Two nodes coincide, in cells that coincide; raised on all ranks.
@@ -291,7 +285,6 @@ def take_up(
     rows = np.zeros((len(motions), problem.full.unknowns.n_dofs))
     for part in split_unknowns(problem):
         nodes = match_values(comm, stored, part.name, locate_nodes(part.space), size)
-        # reshape(-1) would be ambiguous on ranks without nodes.
         width = nodes.shape[1] // len(motions)
         by_row = nodes.reshape(len(nodes), len(motions), width).swapaxes(0, 1)
         rows[:, part.dofs] = by_row.reshape(len(motions), len(nodes) * width)

@@ -49,12 +49,7 @@ class StoredCheckpoint:
 
 
 def write_file(path: Path, scene: dict[str, Any], arrays: dict[str, Array]) -> None:
-    """Write a checkpoint file atomically.
-
-    Raises:
-        OSError: The file cannot be written, or has other content when it is read back. An existing
-            file is unchanged.
-    """
+    """Write a checkpoint file atomically, and read it back; raise OSError if it differs."""
     content = _pack(scene, arrays)
     with files.atomic_write(path) as temporary:
         with open(temporary, "wb") as file:
@@ -73,12 +68,7 @@ def _pack(scene: dict[str, Any], arrays: dict[str, Array]) -> bytes:
 
 
 def read_file(path: Path) -> tuple[dict[str, Any], dict[str, Array]]:
-    """Read scene and arrays of a checkpoint file.
-
-    Raises:
-        ValueError: The file is damaged, or no checkpoint of this format.
-        OSError: The file cannot be read.
-    """
+    """Read scene and arrays; raise ValueError for a damaged file, or one of another format."""
     files.check_file(path)
     content = path.read_bytes()
     end = len(content) - len(_TRAILER) - 64

@@ -49,13 +49,10 @@ def compare_data(
     committed: Array,
     given: Sequence[dict[str, Array]],
 ) -> list[str]:
-    """Describe the differences between the data of a problem and a checkpoint. Collective.
+    """Describe differences between the data of a problem and a checkpoint. Collective.
 
-    Args:
-        stored: The checkpoint.
-        problem: The problem in the state of the checkpoint.
-        committed: The state, as from `ContactProblem.committed_rows`.
-        given: Stored data at the points of every contact.
+    The problem is in the state of the checkpoint, with the rows ``committed``; ``given`` are the
+    stored data at the points of every contact.
     """
     differences = _compare_words(stored.scene["data"], describe_data(problem))
     differences += _compare_probes(problem, stored.arrays)
@@ -132,13 +129,11 @@ def _format_call(item: Any, switches: dict[str, Any]) -> str:
 
 
 def probe(problem: ContactProblem) -> dict[str, Array]:
-    """Return products of smooth fields with stiffness and loads, independent of the ranks.
-
-    Collective.
+    """Return products of smooth fields with stiffness and loads. Collective.
 
     Returns:
-        "stiffness": v·Kw of every pair of the fields, and their reference magnitudes |v| |Kw|;
-        "loads": v·f and the forces on free obstacles, and |v| |f| and the forces' magnitudes.
+        "stiffness": v·Kw of every pair of fields, and the reference magnitudes |v| |Kw|; "loads":
+        v·f and the forces on free obstacles, and their reference magnitudes.
     """
     space = problem.u.function_space
     comm, d = space.mesh.comm, space.mesh.geometry.dim
@@ -256,10 +251,7 @@ def _compare_conditions(problem: ContactProblem, committed: Array) -> list[str]:
 
 
 def point_data(contact: Contact) -> dict[str, Array]:
-    """Return the data of law, obstacle and contact at this rank's points, by name. Collective.
-
-    The results of the last evaluation are unchanged.
-    """
+    """Return the data of law, obstacle and contact at this rank's points, by name. Collective."""
     contact.inputs.update()
     contact.contact_kinematics.update_data()
     data = contact.contact_kinematics.data.values

@@ -212,10 +212,7 @@ def depends_on(problem: ContactProblem, constant: fem.Constant) -> bool:
 
 
 def _contact_depends_on(contact: Contact, constant: fem.Constant) -> bool:
-    """Return whether law, obstacle, gap or weight depend on a constant, True if undecidable.
-
-    It is undecidable for a `SampledObstacle` and for user-defined laws.
-    """
+    """Return whether a contact depends on a constant; True for user-defined laws and samples."""
     is_known = is_built_in(contact.law) and not isinstance(contact.obstacle, SampledObstacle)
     loads = [motion.load() for motion in contact.motions]
     return (
@@ -419,14 +416,7 @@ def _solve(
 
 @dataclasses.dataclass
 class _LoadSegment:
-    """The load path of one call of `increments`.
-
-    Attributes:
-        start: Load parameter at its start.
-        ends: Load parameters at the ends of its increments.
-        reached: Load parameter of the last committed increment.
-        estimate: Whether errors are estimated.
-    """
+    """The load path of one call of `increments`; ``reached`` is its last committed load."""
 
     start: float
     ends: list[float]
@@ -468,12 +458,7 @@ class _LoadSegment:
 
 @dataclasses.dataclass
 class _LoadProgramme:
-    """The successive calls of `increments` for a problem and a checkpoint file.
-
-    Attributes:
-        segments: Their load paths.
-        has_state: Whether the problem has a state of this path; if not, they are complete.
-    """
+    """Successive calls of `increments` for a checkpoint file; all complete without a state."""
 
     segments: list[_LoadSegment]
     has_state: bool
@@ -486,11 +471,7 @@ _programmes = weakref.WeakKeyDictionary()
 def _locate_segment(
     problem: ContactProblem, checkpoint: Path, segment: _LoadSegment
 ) -> tuple[_LoadProgramme, states.StoredCheckpoint | None]:
-    """Find the position of a call in the load path of a checkpoint file. Collective.
-
-    Returns:
-        The calls, including this one, and the checkpoint to be loaded, or None. If the file has
-        later calls, this one is complete, and the result has no state.
+    """Return the calls up to this one, and the checkpoint to be loaded, or None. Collective.
 
     Raises:
         ValueError: The file is of another load path.

@@ -55,13 +55,7 @@ def split_columns(rows: Array, layout: Sequence[tuple[str, int]]) -> dict[str, A
 
 
 def gather(comm: MPI.Comm, locations: Array, *values: Array | dict[str, Array]) -> Array:
-    """Gather rows of locations and values of all ranks on rank 0; (0, 0) elsewhere. Collective.
-
-    Args:
-        comm: The communicator.
-        locations: Locations on this rank, (n, width).
-        values: Columns, (n, n_values) each, or several by name.
-    """
+    """Gather rows of locations (n, width) and values (n, n_values) on rank 0. Collective."""
     columns = [locations]
     for part in values:
         columns += part.values() if isinstance(part, dict) else [part]
@@ -73,13 +67,6 @@ def match_values(
     comm: MPI.Comm, stored: StoredCheckpoint, name: str, locations: Array, mesh_size: float
 ) -> Array:
     """Return the stored values at the locations of this rank, (n, n_values). Collective.
-
-    Args:
-        comm: The communicator.
-        stored: The checkpoint, with rows of locations and values by `gather`.
-        name: Name of the array.
-        locations: Locations on this rank, (n, width).
-        mesh_size: Size of the mesh (length).
 
     Raises:
         ValueError: The stored locations are not those of all ranks, or two of them coincide; raised
@@ -140,11 +127,7 @@ def split_unknowns(problem: ContactProblem) -> list[UnknownField]:
 
 
 def node_coordinates(space: fem.FunctionSpace) -> Array:
-    """Return the coordinates of the owned nodes, (n, gdim).
-
-    Raises:
-        ValueError: The dofs are not values at points.
-    """
+    """Return coordinates of owned nodes, (n, gdim); ValueError if dofs are not values at points."""
     gdim, dofmap = space.mesh.geometry.dim, space.dofmap
     n_owned = dofmap.index_map.size_local
     try:

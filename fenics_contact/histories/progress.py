@@ -19,11 +19,6 @@ class ProgressBar(logging.Filter):
     It shows the completed fraction of the load path and the remaining time, in a terminal or a
     notebook. It is cleared before log records and between increments.
 
-    Args:
-        title: Text in front of the bar; may be empty.
-        start: Load parameter at the start of the history.
-        end: Load parameter at its end.
-
     Raises:
         ValueError: tqdm is not installed.
     """

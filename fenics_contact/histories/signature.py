@@ -46,13 +46,7 @@ class _Symbols:
 
 
 def signature_of_law(law: Law, gdim: int, *, multipliers: bool) -> str:
-    """Return a hash of all UFL expressions and properties of a law.
-
-    Args:
-        law: The law; the values of its parameters do not affect the hash.
-        gdim: Dimension of space.
-        multipliers: Whether it is enforced by multipliers.
-    """
+    """Return a hash of UFL expressions and properties of a law, without values of parameters."""
     symbols = _Symbols(gdim)
     kinematics = PointKinematics(
         symbols.new("gap"),
@@ -84,13 +78,7 @@ def signature_of_law(law: Law, gdim: int, *, multipliers: bool) -> str:
 
 
 def signature_of_obstacle(obstacle: Obstacle, gdim: int) -> str:
-    """Return a hash of gap and direction of an obstacle as functions of position.
-
-    Args:
-        obstacle: The obstacle; values of numbers affect the hash, those of constants and functions
-            do not.
-        gdim: Dimension of space.
-    """
+    """Return a hash of an obstacle's gap and direction, without values of constants and functions."""
     symbols = _Symbols(gdim)
 
     def to_ufl(value: Any) -> Any:
@@ -142,13 +130,7 @@ class _Components:
         self._cache: dict[Any, str] = {}
 
     def hash(self, node: Any, component: tuple[int, ...], bound: dict[int, int]) -> str:
-        """Return the hash of a component.
-
-        Args:
-            node: An expression without products of tensors.
-            component: Indices of the component, one per axis of the expression.
-            bound: Values of its free indices, by their counts.
-        """
+        """Return the hash of a component, given the values of its free indices by their counts."""
         free = getattr(node, "ufl_free_indices", ())
         key = node, component, tuple(bound[i] for i in free)
         if key not in self._cache:

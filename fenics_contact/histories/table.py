@@ -44,12 +44,7 @@ class Table:
 
     A row is written when its increment is committed. In the plane forces, moments, areas and
     energies are per unit thickness, and the header states it, unless the contacts have a weight.
-    The constructor is collective.
-
-    Args:
-        path: The file.
-        problem: The problem.
-        errors: Quantities with error estimates in the steps.
+    The constructor is collective. ``errors`` are quantities with error estimates in the steps.
 
     Raises:
         ValueError: The folder does not exist, or the file is no table; raised on all ranks.
@@ -184,7 +179,6 @@ def read_rows(path: Path, problem: ContactProblem) -> list[dict[str, str]]:
 
     Raises:
         ValueError: The file is no table of a history of these contacts.
-        OSError: The file cannot be read.
     """
     try:
         with open(path, newline="", encoding="utf-8") as file:

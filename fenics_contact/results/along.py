@@ -127,9 +127,7 @@ def _format_point(x: Array, ends: Array) -> str:
 def _chains(vertices: Index, ends: Array) -> list[tuple[Index, bool]]:
     """Return connected curves, open ones first, as facets and whether they are closed.
 
-    Args:
-        vertices: First and last vertex of the facets, (n_facets, 2).
-        ends: Their coordinates, (n_facets, 2, 2).
+    Facets have first and last vertices (n_facets, 2) with coordinates (n_facets, 2, 2).
     """
     order = by_place(ends[:, 0])
     leaving: dict[int, list[int]] = {}
@@ -188,11 +186,7 @@ def _in_range(abscissa: Array, near: Mask) -> Mask:
 def _is_monotonic(slope: Array, facet: Index, number: Index, shown: Mask) -> bool:
     """Return whether every curve is monotonic along an axis at the shown points.
 
-    Args:
-        slope: Cosine of the angle between facets and the axis, (n_facets,).
-        facet: Facet of each point, (n_points,).
-        number: Curve of each point, (n_points,).
-        shown: Which points are shown, (n_points,).
+    ``slope`` is the cosine of the angle between facets and the axis, (n_facets,).
     """
     signs = np.where(np.abs(slope) > _ROUND_OFF_RATIO, np.sign(slope), 0)[facet]
     kinds = (np.unique(signs[shown & (number == n)]) for n in np.unique(number[shown]))

@@ -112,13 +112,8 @@ class Shape:
 class ShapeEvaluator:
     """Evaluates the present `Shape` of a body when called. The constructor is collective.
 
-    Args:
-        u: Displacement.
-        stress: UFL tensor (3, 3), whose von Mises stress is evaluated; or None.
-
     Raises:
-        ValueError: u is no displacement, or the stress has another shape. The von Mises stress of a
-            plane body depends on the out-of-plane stress.
+        ValueError: u is no displacement, or the stress is no tensor (3, 3).
     """
 
     def __init__(self, u: fem.Function, stress: Any = None) -> None:

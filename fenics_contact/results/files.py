@@ -12,10 +12,7 @@ __all__ = ["atomic_write", "check_file", "check_folder", "make_folder"]
 
 
 def check_file(path: Path) -> None:
-    """Raise ValueError for a device, a pipe or a socket. On the calling rank only.
-
-    Reading from one may not end, and an atomic write would replace it.
-    """
+    """Raise ValueError for a device, a pipe or a socket. On the calling rank only."""
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise ValueError(
             f"{path} is a device, a pipe or a socket, which a file would replace; give the name of "
@@ -26,9 +23,7 @@ def check_file(path: Path) -> None:
 def check_folder(name: str, path: Path) -> None:
     """Check that the folder of a file exists and is writable. On the calling rank only.
 
-    Raises:
-        ValueError: The folder does not exist.
-        OSError: The folder is not writable.
+    Raises ValueError if it does not exist, OSError if it is not writable.
     """
     folder = path.parent
     if not folder.is_dir():
@@ -43,9 +38,7 @@ def check_folder(name: str, path: Path) -> None:
 def make_folder(path: Path) -> None:
     """Create a folder and its parents, if necessary. On the calling rank only.
 
-    Raises:
-        NotADirectoryError: The path or a parent exists and is no folder.
-        OSError: The folder cannot be created, or is not writable.
+    Raises OSError if it cannot be created, or is not writable.
     """
     existing = next((p for p in (path, *path.parents) if p.exists()), None)
     if existing is not None and not existing.is_dir():
@@ -60,11 +53,8 @@ def make_folder(path: Path) -> None:
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Provide a temporary path, which replaces ``path`` if the block ends without an error.
 
-    After an error ``path`` is unchanged. On the calling rank only.
-
-    Raises:
-        FileNotFoundError: The folder does not exist.
-        ValueError: ``path`` is a device, a pipe or a socket.
+    After an error ``path`` is unchanged. On the calling rank only. Raises FileNotFoundError without
+    its folder, and ValueError if ``path`` is no regular file.
     """
     path = Path(path)
     check_file(path)

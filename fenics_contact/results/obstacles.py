@@ -128,12 +128,8 @@ def box_about(points: Array, margin: float) -> Array:
 def zero_level(points: Array, values: Array) -> Array:
     """Return the zero level set of a function that is linear on simplices of a grid.
 
-    Args:
-        points: Grid points, (n, …, n, d), d = 2 or 3.
-        values: Values at the grid points, negative inside, (n, …, n).
-
-    Returns:
-        Vertices of segments, or in space of triangles, (m, d, d).
+    Points (n, …, n, d) have values (n, …, n), negative inside. The result are the vertices of
+    segments, or in space of triangles, (m, d, d).
     """
     d, n = points.shape[-1], points.shape[0]
     number = np.arange(n**d).reshape((n,) * d)

@@ -64,11 +64,7 @@ class Grid:
 
 
 def write_grid(path: Path, grid: Grid) -> None:
-    """Write a ``.vtu`` file. Vectors and tensors in the plane are extended by zeros.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write a ``.vtu`` file. Vectors and tensors in the plane are extended by zeros."""
     n_cells, n_nodes = grid.points.shape[:2]
     n = n_cells * n_nodes
     topology: dict[str, npt.NDArray[Any]] = {
@@ -101,11 +97,7 @@ def write_grid(path: Path, grid: Grid) -> None:
 
 
 def write_series(path: Path, states: list[tuple[float, str]]) -> None:
-    """Write a ``.pvd`` file with times and names of files in the same folder.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write a ``.pvd`` file with times and names of files in the same folder."""
     lines = [
         f'<DataSet timestep="{time!r}" part="0" file={quoteattr(name)}/>' for time, name in states
     ]
@@ -118,7 +110,6 @@ def read_series(path: Path) -> list[tuple[float, str]]:
 
     Raises:
         ValueError: The file is damaged, or was not written by `write_series`.
-        OSError: The file cannot be read.
     """
     if not path.exists():
         return []
