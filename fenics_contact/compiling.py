@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 logger = logging.getLogger("fenics_contact")
-# Below the first time (seconds) a form came from the cache; from the second on a message is shown.
+# Seconds up to which a form came from the cache, and from which a message is shown.
 _CACHE_HIT_SECONDS, _MESSAGE_SECONDS = 0.1, 3.0
 
 

@@ -301,8 +301,8 @@ def _expand_tags(
         if tags is not None and len(tags.indices):
             if tags.indices.max() >= n:
                 raise ValueError(
-                    f"{what} are on number {tags.indices.max()}, and the mesh has {n} there: give "
-                    "the tags of this mesh"
+                    f"{what} have the index {tags.indices.max()}, but the mesh has {n} entities: "
+                    "give the tags of this mesh"
                 )
             old, inverse = np.unique(tags.values, return_inverse=True)
             new_tags[tags.indices] = np.array([numbers[tag] for tag in old.tolist()])[inverse]

@@ -78,7 +78,7 @@ def signature_of_law(law: Law, gdim: int, *, multipliers: bool) -> str:
 
 
 def signature_of_obstacle(obstacle: Obstacle, gdim: int) -> str:
-    """Return a hash of an obstacle's gap and direction, without values of constants and functions."""
+    """Return a hash of an obstacle's gap and direction, without values of its coefficients."""
     symbols = _Symbols(gdim)
 
     def to_ufl(value: Any) -> Any:

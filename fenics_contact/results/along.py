@@ -219,6 +219,6 @@ def _angles(arm: Array, number: npt.NDArray[Any]) -> Array:
     for n in np.unique(number):
         curve = number == n
         unwrapped = np.unwrap(angles[curve], period=360.0)
-        middle = (unwrapped.min() + unwrapped.max()) / 2
-        angles[curve] = unwrapped - 360.0 * np.round(middle / 360.0)
+        midrange = (unwrapped.min() + unwrapped.max()) / 2
+        angles[curve] = unwrapped - 360.0 * np.round(midrange / 360.0)
     return angles

@@ -132,8 +132,8 @@ class ShapeEvaluator:
                     f"stress has shape {tensor.ufl_shape}; the von Mises stress needs a tensor "
                     "(3, 3), such as that of elasticity.LinearElastic"
                 )
-            middle = basix.geometry(basix.CellType[mesh.topology.cell_name()]).mean(axis=0)
-            self._stress = compile_expression(tensor, middle[None])
+            midpoint = basix.geometry(basix.CellType[mesh.topology.cell_name()]).mean(axis=0)
+            self._stress = compile_expression(tensor, midpoint[None])
         if self._dim == 3:
             mesh.topology.create_connectivity(2, 3)
             self._facets = FacetSet(u.function_space, exterior_facet_indices(mesh.topology))
