@@ -268,7 +268,7 @@ def test_parts_that_are_none() -> None:
         ([(mesh, halves)], ["float64", "integers"]),
     ):
         raised_everywhere(lambda parts=parts: fc.join_meshes(parts), ValueError, *words)
-    with pytest.raises(ValueError, match=r"facet_tags of body 0 are on number .* of this mesh"):
+    with pytest.raises(ValueError, match=r"facet_tags of body 0 have the index .* of this mesh"):
         fc.join_meshes([(mesh, None, far)])
 
 

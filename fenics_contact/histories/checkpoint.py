@@ -126,8 +126,8 @@ def save(
         arrays[f"contact {contact.name}"] = gather(comm, points, contact.history.rows(), data)
         arrays[f"values {contact.name}"] = gather(comm, points, values)
     for number, field in enumerate(state_fields):
-        nodes = locate_nodes(field.function_space)
-        arrays[f"field {number}"] = gather(comm, nodes, nodal_values(field))
+        locations = locate_nodes(field.function_space)
+        arrays[f"field {number}"] = gather(comm, locations, nodal_values(field))
     with collective_errors(comm):
         if comm.rank == 0:
             for name, array in arrays.items():

@@ -395,7 +395,7 @@ def _add_contact(page: _Page, contact: Contact, step: Step, magnification: float
         )
         for state in table.STATES
     ]
-    area = f"area [{page.length}²{page.per(contact.inputs.per_thickness)}]"
+    area = f"area [{page.length}²{page.unit_suffix(contact.inputs.per_thickness)}]"
     header = ("state", area, f"from [{page.length}]", f"to [{page.length}]")
     page.add(html_table("Extents on the undeformed surface", header, rows))
 
