@@ -67,7 +67,7 @@ def page(found: dict[str, list[Row]]) -> str:
     lines = ["# Random scenes", ""]
     lines += report.text(
         f"**{wrong} of {total} random scenes had a wrong result when they were run**, of which 3 "
-        "are not explained ([below](#wrong-results)). Every scene is given to the package and to "
+        "are not explained ([below](#wrong-results)). Every scene is solved by the package and by "
         f"an independent solver, {increments:,} increments in all; 1748 scenes that were run "
         "before are not in the table."
     )
@@ -86,13 +86,13 @@ def page(found: dict[str, list[Row]]) -> str:
         "a force; all laws; prescribed gaps; forces over six decades; loading, unloading, reversal "
         "and reloading; halved increments, restarts, pair updates, units, enforcement, accuracy "
         "and methods; one rank or several (`--ranks`). The bulk is written in seven equivalent "
-        "forms. A scene is identified by its seed (`--seed`), and one that fails is reduced "
-        "(`--minimise`).",
+        "forms. A scene is identified by its seed (`--seed`); failing scenes are reduced by "
+        "`--minimise`.",
         "The independent solver (`verification/reference_solver.py`) shares only DOLFINx's "
         "assembly of the bulk: geometry, pairing, projection, laws, condensation and solution are "
-        "its own. A hundred scenes, and those that were once wrong, are among the tests "
-        "(`tests/test_fuzz.py`). All outcomes are in `verification/campaign.csv` and the files "
-        "beside it; `python verification/fuzz.py --table FILE` counts them by feature.",
+        "its own. `tests/test_fuzz.py` has a hundred scenes, and those that were once wrong. All "
+        "outcomes are in `verification/campaign.csv` and similar files; `python "
+        "verification/fuzz.py --table FILE` counts them by feature.",
         "- **Unrelated bodies, thin obstacles, long paths** (`--mixed`): all generators, with an "
         "unrelated loaded body in the same mesh in a quarter of the scenes; plates, blades and "
         "pins thinner than a facet that are pressed, slid past an end or moved through; sliding "
@@ -119,32 +119,31 @@ def page(found: dict[str, list[Row]]) -> str:
         "- Seed 900161 (three bodies, augmented Lagrangian, unloading, restart): a multiplier has "
         "an error of 1.4e-8, the independent solver allows 2.9e-9. Which of the two is wrong is "
         "not known.",
-        "- Seed 807869 (two bodies, an unrelated one with 1e8 times their load) was judged by a "
-        "tolerance relative to the largest force; it is correct by now.",
-        "- The other mixed scenes: one was a fault of the independent solver (804811). Corrected "
-        "are: slip of a body that is carried along with its obstacle in the increment in which it "
-        "is positioned (804145); a pin of 6 % of a facet that passes through in small increments "
-        "(804158); round-off of a removed load that counted as contact force (804043, 805153, "
-        "805155, 805171); cells inverted at a vertex (804316); pins that pass between quadrature "
-        "points (804679, 805229, 805231), most of them with one point per facet, which is "
-        "refused now.",
+        "- Seed 807869 (two bodies, an unrelated one with 1e8 times their load) was verified with "
+        "a tolerance relative to the largest force; it is correct now.",
+        "- The other mixed scenes: one is an error of the independent solver (804811). Corrected "
+        "are: slip of a body that follows its obstacle in the increment in which it is positioned "
+        "(804145); a pin of 6 % of a facet that passes through in small increments (804158); "
+        "round-off of a removed load, taken as contact force (804043, 805153, 805155, 805171); "
+        "cells inverted at a vertex (804316); pins that pass between quadrature points (804679, "
+        "805229, 805231), most of them with one point per facet, which is refused now.",
         "- 1748 mixed scenes were run before those of the file. Of all 3273, 84 were wrong and 6 "
         "crashed: 35 thin obstacles passed through Γc undetected, 11 had wrong slip of an obstacle "
-        "pressed by a force, 25 were faults of the independent solver. All crashes were a NumPy "
+        "pressed by a force, 25 were errors of the independent solver. All crashes were a NumPy "
         "warning. The causes are corrected; 26 of 30 that were solved again are correct or "
         "refused.",
         f"- Of the later {len(later)} mixed scenes {solved} did not converge and were solved by "
         f"the independent solver, and {required} refusals are required by the geometry. In one a "
-        "pin sank slowly into a flat cell (813024), and in one the middles of quadratic facets "
-        "passed through the obstacle between the points of vertex quadrature (814618): both are "
-        "refused now. In one a point is 1e-9 of the length away from the vertex of a polygon, "
+        "pin penetrated slowly into a flat cell (813024), and in one the midpoints of quadratic "
+        "facets passed through the obstacle between the points of vertex quadrature (814618): both "
+        "are refused now. In one a point is 1e-9 of the length away from the vertex of a polygon, "
         "whose normal there has a round-off of 5e-8 (815370).",
-        "- Not explained, besides the first, are a penetration with multipliers 10 % above "
-        "what is allowed, on a single facet (815746), and a slip reference taken 1e-4 of the "
-        "body's size inside of the obstacle, a plate that passes by (815922).",
-        "- Faults found earlier by scenes of two bodies are corrected and among the tests: a "
-        "resumed history refused for the round-off of a prescribed zero, a NumPy error for a "
-        "flattened surface, a residual of 5e-7 of a soft body's forces taken for the round-off of "
+        "- Not explained, besides the first, are a penetration with multipliers 10 % above the "
+        "tolerance, on a single facet (815746), and a slip reference 1e-4 of the body's size "
+        "inside the obstacle, a plate that slides past the body (815922).",
+        "- Errors detected earlier by scenes of two bodies are corrected and tested: a resumed "
+        "history refused because of the round-off of a prescribed zero, a NumPy error for a "
+        "flattened surface, a residual of 5e-7 of a soft body's forces taken as the round-off of "
         "a stiff one (`tests/test_scales.py`), and a displacement of 1e-12 at Dirichlet nodes.",
     )
     lines += ["## Refusals", ""]
@@ -166,8 +165,8 @@ def page(found: dict[str, list[Row]]) -> str:
     lines += report.text(
         "- Of the first 533 scenes that did not converge although the independent solver found a "
         "solution, 201 had limited iterations or halvings; the others are loads that the package "
-        "should have solved, or refuses on purpose, as when a body passes through Γc between its "
-        "points.",
+        "should have solved, or refuses intentionally, such as a body that passes through Γc "
+        "between its points.",
         "- First mixed scenes: 82 did not converge and were solved by the independent solver; 69 "
         "refusals are required by the geometry.",
         "- Dissimilar bodies: in 13 of 18 refusals the opposing surface penetrates Γc between its "
@@ -175,13 +174,13 @@ def page(found: dict[str, list[Row]]) -> str:
     )
     lines += ["## Limits of the comparison", ""]
     lines += report.text(
-        "- Scenes were run once, with the package of that time. Scenes that were wrong by a fault "
+        "- Scenes were run once, with the package of that time. Scenes that were wrong by an error "
         "of the independent solver were run again after its correction.",
-        "- Faults of the independent solver were: integrals between curved facets; round-off if Γc "
+        "- Errors of the independent solver were: integrals between curved facets; round-off if Γc "
         "is a single point; the non-uniqueness of friction multipliers at constrained nodes; "
         "penalty forces at points that lost their pairs; the nearest point of a friction polygon; "
-        "multipliers that no displacement can change; the depth of bodies that were not "
-        "positioned; residuals relative to the forces that carry a body along.",
+        "multipliers in the kernel of the coupling matrix; the penetration of bodies that were not "
+        "positioned; residuals relative to the forces that move a body with its obstacle.",
         "- In 8 correct scenes with finite kinematics and rigid obstacles, and in 18 with "
         "dissimilar bodies, the independent solver did not reach the end of the history.",
         "- Seeds from 600000 on are families of 12 (`--alike 12`), from 720000 on of 48, that "

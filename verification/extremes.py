@@ -602,11 +602,11 @@ def page(rows: list[Row]) -> str:
     lines += ["![Effect of the contact stiffness](extremes-stiffness.png)", ""]
     lines += report.text(
         "*Left: SNES iterations of one increment, of all attempts. With μ = 0.3 and k_n h/E of 1e4 "
-        "or more Newton's method and L-BFGS mostly fail from the unloaded state, and other methods "
-        "take over. Right: a penalty ε = E\\*/(k_n a) changes Hertz's peak "
+        "or more Newton's method and L-BFGS mostly fail from the unloaded state, and fallback "
+        "methods follow. Right: a penalty ε = E\\*/(k_n a) changes Hertz's peak "
         "pressure by at most ε (contact half-width a); for ε > 1 the contact behaves as an elastic "
-        "foundation, whose peak pressure is then the reference. The mesh has ten cells in a; 1 % "
-        "is allowed for it.*"
+        "foundation, whose peak pressure is then the reference. The mesh has ten cells in a; the "
+        "tolerance includes 1 % for its error.*"
     )
     lines += ["## Closest to the tolerance", ""]
     near = [r for r in rows if r.is_compared and 0 < r.tolerance < np.inf and r.method == "newton"]
@@ -628,9 +628,9 @@ def page(rows: list[Row]) -> str:
         "Where one slave facet spans 20 master facets, 2 quadrature points per facet are too few; "
         "with 40 the error is 3.9e-2, with 80 it is 1.5e-2. The gap of 1000 heights is closed if "
         "the increment may be halved 14 times (`max_cuts=14`; 6 by default).",
-        "Sliding off an end is refused where the corner of the last facet is deeper than the "
-        "points around explain, all of which are open by then: finer facets, or more points, are "
-        "needed.",
+        "Sliding off an end is refused if the corner of the last facet is deeper than "
+        "extrapolated from the surrounding points, all of which are open: use finer facets, or "
+        "more points.",
         f"{len(free)} verified runs have no reference, because the method or solver that would "
         "give it fails: " + "; ".join(dict.fromkeys(f"{r.group}: {r.case}" for r in free)) + ".",
     )
