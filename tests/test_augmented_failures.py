@@ -37,7 +37,7 @@ def test_failure_leaves_no_trace(what: str, monkeypatch: pytest.MonkeyPatch) -> 
 
     before = state()
     if what == "rounds":
-        monkeypatch.setattr(module, "_MAX_ROUNDS", 2)
+        monkeypatch.setattr(module, "_MAX_AUGMENTATIONS", 2)
     else:
         problem.snes.setTolerances(max_it=0)
         problem.solver.main.max_it = 0

@@ -1,1 +1,1 @@
-"""How the equations are solved."""
+"""Solution methods for the contact equations of one increment."""

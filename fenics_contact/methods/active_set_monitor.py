@@ -1,4 +1,4 @@
-"""Chattering: points of Γc that change their status again and again, and nothing is gained."""
+"""Detection of chattering: points of Γc that change their status repeatedly without progress."""
 
 from __future__ import annotations
 
@@ -13,78 +13,78 @@ from fenics_contact.types import Array
 
 __all__ = ["ActiveSetMonitor"]
 
-# Changes of a point's status since the residual last fell that make it a chattering one, and the
-# share by which it has to fall to count.
-_CHANGES = 3
-_FALL = 0.9
+# Status changes since the residual last decreased from which on a point chatters.
+_CHATTERING_CHANGES = 3
+# Ratio to the previous residual below which a residual counts as a decrease.
+_DECREASE_RATIO = 0.9
 
 
 class ActiveSetMonitor:
-    """Looks at the status of all points from iteration to iteration.
+    """Residual and status of all points over the iterations of one solution.
 
     Attributes:
-        idle: Looks since the residual was at its least, without those of its present fall.
-        tractions: Of every contact at the first look, (n_points, gdim) (stress).
+        n_stalled: Iterations since the least residual, without those of a decrease in progress.
+        initial_tractions: Of every contact at the first iterate, (n_points, gdim) (stress).
     """
 
     def __init__(self, contacts: Sequence[Contact]) -> None:
         self._contacts = contacts
         n = sum(c.quadrature.n_points for c in contacts)
-        self.idle = self._since = 0  # the latter with those of its present fall
+        self.n_stalled = self._since = 0  # the latter with those of a decrease in progress
         self._best = self._last = np.inf
-        self.tractions: list[Array] = []
+        self.initial_tractions: list[Array] = []
         self._status = np.full(n, -1, dtype=np.int8)
         self._changes = np.zeros(n, dtype=np.int64)
-        self._seen = np.zeros((len(Status), n), dtype=np.bool_)
+        self._status_mask = np.zeros((len(Status), n), dtype=np.bool_)
 
-    def start(self) -> None:
-        """Forget what was seen."""
-        self.idle, self._since, self.tractions = 0, 0, []
+    def reset(self) -> None:
+        """Clear the record before a solution."""
+        self.n_stalled, self._since, self.initial_tractions = 0, 0, []
         self._best = self._last = np.inf
-        self._status[:], self._changes[:], self._seen[:] = -1, 0, False
+        self._status[:], self._changes[:], self._status_mask[:] = -1, 0, False
 
-    def note(self, residual: float) -> None:
-        """Look at the contacts as evaluated.
+    def record(self, residual: float) -> None:
+        """Record the status of the evaluated contacts.
 
         Args:
-            residual: Norm of the residual there, the same on all ranks.
+            residual: Norm of the residual, equal on all ranks.
         """
         if not self._contacts:
             return
-        if not self.tractions:
-            self.tractions = [c.values.total_traction for c in self._contacts]
+        if not self.initial_tractions:
+            self.initial_tractions = [c.values.total_traction for c in self._contacts]
         status = np.concatenate([c.status for c in self._contacts])
-        seen = status == np.arange(len(Status))[:, None]
-        if residual < _FALL * self._best:
-            self._best, self.idle, self._since = residual, 0, 0
-            self._changes[:], self._seen = 0, seen
+        status_mask = status == np.arange(len(Status))[:, None]
+        if residual < _DECREASE_RATIO * self._best:
+            self._best, self.n_stalled, self._since = residual, 0, 0
+            self._changes[:], self._status_mask = 0, status_mask
         else:
             self._since += 1
-            if not residual < _FALL * self._last:
-                self.idle = self._since
+            if not residual < _DECREASE_RATIO * self._last:
+                self.n_stalled = self._since
             self._changes += status != self._status
-            self._seen |= seen
+            self._status_mask |= status_mask
         self._status, self._last = status, residual
 
-    def chattering(self) -> str:
-        """How many points chatter, between what and where; empty if none does. Collective."""
-        found, first = [], 0
+    def describe_chattering(self) -> str:
+        """Describe number, status and location of chattering points, if any. Collective."""
+        descriptions, first = [], 0
         for contact in self._contacts:
             comm, n_points = contact.surface.mesh.comm, contact.quadrature.n_points
             part = slice(first, first + n_points)
             first += n_points
-            restless = self._changes[part] >= _CHANGES
-            n = int(global_sum(comm, np.count_nonzero(restless)))
+            chatters = self._changes[part] >= _CHATTERING_CHANGES
+            n = int(global_sum(comm, np.count_nonzero(chatters)))
             if not n:
                 continue
-            states = global_sum(comm, self._seen[:, part][:, restless].any(axis=1))
+            states = global_sum(comm, self._status_mask[:, part][:, chatters].any(axis=1))
             closed = {} if contact.law.has_tangential else {Status.SLIP: "closed"}
             names = " and ".join(closed.get(s, s.name.lower()) for s in Status if states[s])
-            rows = np.column_stack([-self._changes[part], contact.points])[restless]
+            rows = np.column_stack([-self._changes[part], contact.points])[chatters]
             rows = gather_rows(comm, rows)
-            worst = rows[np.lexsort(rows.T[::-1])][0, 1:]
-            found.append(
+            where = rows[np.lexsort(rows.T[::-1])][0, 1:]
+            descriptions.append(
                 f"{contact.name} chatters: {n} of {int(global_sum(comm, n_points))} points keep "
-                f"changing between {names}, most often at ({', '.join(f'{x:.4g}' for x in worst)})"
+                f"changing between {names}, most often at ({', '.join(f'{x:.4g}' for x in where)})"
             )
-        return "; ".join(found)
+        return "; ".join(descriptions)

@@ -1,4 +1,4 @@
-"""What was tried to solve an increment."""
+"""Record of an attempt to solve an increment."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Attempt:
     Attributes:
         method: A method of `ContactProblem`; or "cut", if `increments` halved the increment.
         iterations: Number of SNES iterations.
-        outcome: "converged", or in words why the increment was solved again or not at all.
+        outcome: "converged", or the reason why the increment was solved again or not at all.
     """
 
     method: str

@@ -68,7 +68,7 @@ class Continuation(StandaloneMethod):
         try:
             while iterations <= _MAX_ITERATIONS:
                 self._soften(share)
-                equations.monitor.start()
+                equations.monitor.reset()
                 made, reason = self._newton.solve()
                 iterations += made
                 self.by_newton = reason > 0

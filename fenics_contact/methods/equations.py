@@ -55,7 +55,7 @@ class Equations:
         has_round_off: Whether a matrix was assembled in this increment, which tells the round-off
             of its residuals.
         rtol: Residual that ends the whole solution, as a share of the forces.
-        round_rtol: That of the present round of multipliers, if larger.
+        augmentation_rtol: That of the present round of multipliers, if larger.
         solution: The state to start from and, after a method, the one found; dimensionless.
         function: For the residual.
         solvers: Linear solvers for H₀ (False) and the consistent tangent (True).
@@ -82,7 +82,7 @@ class Equations:
         nothing: Array = np.zeros(full.n_bodies)
         self.norms = Norms(nothing, nothing, nothing, nothing, nothing.size)
         self.start = InitialForces(nothing, np.zeros((len(full.contacts), full.n_bodies)))
-        self.rtol = self.round_rtol = 0.0
+        self.rtol = self.augmentation_rtol = 0.0
         self.solvers: dict[bool, PETSc.KSP] = {}
         self.by_cycle, self.hierarchy = False, Hierarchy()
         self.factorisations = 0
@@ -158,7 +158,7 @@ class Equations:
 
     def solved(self, rtol: float = 0.0) -> bool:
         """Whether the residual computed last ends the present round, or is below ``rtol``."""
-        return self.norms.within(max(self.rtol, self.round_rtol, rtol))
+        return self.norms.within(max(self.rtol, self.augmentation_rtol, rtol))
 
     def find_overload(self) -> Overload | None:
         """See `find_overload`, by the pressures evaluated last; of linear bodies. Collective."""
@@ -244,7 +244,7 @@ class Equations:
 
     def note(self) -> None:
         """Let `watch` see the status of the points, evaluated where `norms` are from."""
-        self.monitor.note(self.norms.total)
+        self.monitor.record(self.norms.total)
 
     def is_constrained(self) -> bool:
         """Whether the closed points hold all free motions. Collective."""
@@ -292,7 +292,7 @@ class Equations:
             return None
         # Of a body that was positioned round-off closes some of many points.
         idle = full.contact_force_sizes() < _OPEN_SHARE * self.loads
-        first = self.monitor.tractions or [c.values.total_traction for c in self.contacts]
+        first = self.monitor.initial_tractions or [c.values.total_traction for c in self.contacts]
         return UnconstrainedModes.find(motions, full.scales, full.operators, full.load, first, idle)
 
     def tangents(self) -> Iterator[PETSc.Mat]:

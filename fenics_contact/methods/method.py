@@ -26,7 +26,7 @@ __all__ = ["Method", "Newton", "SnesMethod", "SolverContext", "StandaloneMethod"
 _DECREASE = 0.1
 # Share of a step from which on it is the whole one, and no half: multigrid has it to a hundredth.
 _WHOLE = 0.9
-# Iterations without a lower residual, see `ActiveSetMonitor.idle`, after which another method takes
+# Iterations without a lower residual, see `ActiveSetMonitor.n_stalled`, after which another method takes
 # over.
 _PATIENCE = 14
 # What shows how a solver fares; under the problem's own prefix it is for those inside, too.
@@ -114,7 +114,7 @@ class StandaloneMethod(Method):
     ``equations.residual``. Newton's method of `SolverContext.newton` does both: `Newton.attach` it
     before
     every solution, and return what its ``solve`` returns. It gives up after 14 iterations without
-    a lower residual (`ActiveSetMonitor.idle`), so that the methods that follow get their turn.
+    a lower residual (`ActiveSetMonitor.n_stalled`), so that the methods that follow get their turn.
 
     Attributes:
         by_newton: Whether Newton's method found the last solution, so that the consistent tangent
@@ -213,7 +213,7 @@ class SnesMethod(Method):
         """Why SNES ends here, or that it goes on, as SNES has it."""
         if self._equations.solved(self.coarse):
             return int(_REASONS.CONVERGED_FNORM_RELATIVE)
-        if self._equations.monitor.idle > _PATIENCE and self.gives_up():
+        if self._equations.monitor.n_stalled > _PATIENCE and self.gives_up():
             return int(_REASONS.DIVERGED_LINE_SEARCH)
         return int(_REASONS.ITERATING)
 

@@ -18,7 +18,7 @@ from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.methods.attempt import Attempt
-from fenics_contact.methods.augmented_lagrangian import INNER, solve_augmented_lagrangian
+from fenics_contact.methods.augmented_lagrangian import RESIDUAL_ERROR_RATIO, solve_augmented_lagrangian
 from fenics_contact.methods.continuation import Continuation
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.linearised_solve import linearised, respond
@@ -196,7 +196,7 @@ class Solver:
         if settings.accuracy is not None:
             # Residuals as large as what multipliers may miss would make rounds that change nothing.
             augmented = [c for c in self._full.contacts if c.multipliers is not None]
-            least = [INNER * c.tolerance for c in augmented]
+            least = [RESIDUAL_ERROR_RATIO * c.tolerance for c in augmented]
             options.set({"snes_rtol": min(settings.accuracy.rtol, *least, 1.0)}, prefix)
             if self._comm.rank == 0:
                 logger.info("accuracy %s", settings.accuracy)
@@ -477,7 +477,7 @@ class Solver:
         """
         equations = self.equations
         factored = self.predictor.factored
-        equations.monitor.start()
+        equations.monitor.reset()
         chosen = self.predictor.choose(first_round=first_round, cold=cold)
         start: Array = np.divide(chosen, equations.length)
         attempts: list[Attempt] = []
@@ -488,7 +488,7 @@ class Solver:
         equations.overload = None
         for method in methods:
             equations.solution.array[:] = start
-            equations.monitor.start()
+            equations.monitor.reset()
             if stiffness_changed:
                 equations.h0_is_made = False
             iterations, reason = self.methods.get(method, self.main).solve()
@@ -535,7 +535,7 @@ class Solver:
         if (overload := self.equations.overload) is not None:
             return overload.in_words()
         words = _OUTCOMES.get(reason, f"SNES reason {reason}")
-        return "; ".join(filter(None, (words, self.equations.monitor.chattering())))
+        return "; ".join(filter(None, (words, self.equations.monitor.describe_chattering())))
 
     def can_fall_back(self) -> bool:
         """Whether to go on after a failure: not if iterations are rationed by the caller."""
