@@ -1,8 +1,7 @@
-"""Callbacks of SNES that keep an error until SNES has returned.
+"""SNES callbacks that store a Python exception and raise it after SNES has returned.
 
-PETSc carries no exception of Python: what leaves a callback comes out as an error code of PETSc's
-own, and leaves vectors locked behind it. So SNES is told that the residual is not a number, which
-ends it in good order, and then the error is raised. An interrupt waits for the next callback.
+An exception inside a callback would become a PETSc error code and leave vectors locked. Instead the
+residual is set to NaN, which ends SNES cleanly. Interrupts are deferred to the next callback.
 """
 
 from __future__ import annotations
@@ -26,30 +25,27 @@ __all__ = ["Callbacks", "interrupts_held", "release_interrupt"]
 
 
 class _Interrupt:
-    """An interrupt that waits, and what it was to do; there is one Ctrl-C for all problems."""
+    """Handler and arguments of the deferred interrupt, global for all problems."""
 
     handler: Any = None
     arguments: tuple[Any, ...] = ()
 
 
-def _keep(*arguments: Any) -> None:
+def _defer(*arguments: Any) -> None:
     _Interrupt.arguments = arguments
 
 
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Hold back Ctrl-C inside the block: Python would raise where PETSc has just called it.
-
-    Nor must it tear apart what belongs together. `release_interrupt` lets it through.
-    """
+    """Defer Ctrl-C inside the block, in which PETSc calls Python, until `release_interrupt`."""
     handler = signal.getsignal(signal.SIGINT)
     main = threading.current_thread() is threading.main_thread()
-    if handler is _keep or not callable(handler) or not main:
+    if handler is _defer or not callable(handler) or not main:
         yield
         return
     _Interrupt.handler, _Interrupt.arguments = handler, ()
     try:
-        signal.signal(signal.SIGINT, _keep)
+        signal.signal(signal.SIGINT, _defer)
         yield
     finally:
         signal.signal(signal.SIGINT, handler)
@@ -57,23 +53,23 @@ def interrupts_held() -> Iterator[None]:
 
 
 def release_interrupt() -> None:
-    """Do what an interrupt that waits was to do, usually raise KeyboardInterrupt."""
+    """Call the handler of a deferred interrupt, which usually raises KeyboardInterrupt."""
     arguments, _Interrupt.arguments = _Interrupt.arguments, ()
     if arguments:
         _Interrupt.handler(*arguments)
 
 
 class Callbacks:
-    """The callbacks of one SNES, which is no part of it: SNES keeps them, and would keep itself.
+    """The callbacks of one SNES, without a reference to the SNES, which would be a cycle.
 
     Args:
-        comm: The ranks of the SNES.
+        comm: The communicator of the SNES.
     """
 
     def __init__(self, comm: MPI.Comm) -> None:
         self._comm = comm
         self._error: BaseException | None = None
-        # Where the residual was computed last, and it.
+        # The last residual, preceded by its x.
         self._last: tuple[Array, ...] = ()
 
     def attach(
@@ -85,20 +81,24 @@ class Callbacks:
         matrix: PETSc.Mat,
         reason: Callable[[], int],
     ) -> None:
-        """Give SNES its callbacks, which must not keep the SNES.
+        """Set the callbacks of SNES, which must not refer to the SNES.
 
         Args:
             snes: The solver.
-            residual: Computes it at x, into f.
-            vector: For the residual.
-            jacobian: Assembles the matrix at x.
-            matrix: That matrix.
-            reason: Whether to end, by what ``residual`` left; only asked where that is finite.
+            residual: Compute the residual at x into f.
+            vector: Vector for the residual.
+            jacobian: Assemble the matrix at x.
+            matrix: The matrix.
+            reason: Return the SNES reason after ``residual``, called if the residual is finite.
         """
 
         def test(_: Any, iteration: int, norms: tuple[float, float, float]) -> int:
-            lost = compat.NOT_FINITE
-            return int(self._run(reason, otherwise=lost)) if np.isfinite(norms[2]) else lost
+            not_finite = compat.NOT_FINITE
+            return (
+                int(self._run(reason, otherwise=not_finite))
+                if np.isfinite(norms[2])
+                else not_finite
+            )
 
         snes.setFunction(lambda _, x, f: self._compute(residual, x, f), vector)
         snes.setJacobian(lambda _, x, J, P: self._run(jacobian, x, J), matrix)
@@ -111,13 +111,13 @@ class Callbacks:
         vector: PETSc.Vec,
         measure: Callable[[PETSc.Vec, PETSc.Vec], float],
     ) -> None:
-        """Give the line search of SNES a measure of the residual that it is to lower.
+        """Set a level function of the residual as the objective of the line search.
 
         Args:
             snes: The solver.
-            residual: As for `attach`.
-            vector: For the residual, not that of SNES.
-            measure: Of x and a residual there that is finite.
+            residual: Compute the residual at x into f.
+            vector: Vector for the residual, other than that of SNES.
+            measure: Return the level of x and its finite residual.
         """
 
         def level(_: Any, x: PETSc.Vec) -> float:
@@ -128,35 +128,35 @@ class Callbacks:
         snes.setObjective(level)
 
     def set_objective(self, snes: PETSc.SNES, energy: Callable[[PETSc.Vec], float]) -> None:
-        """Give the line search of SNES what it is to lower."""
+        """Set the energy as the objective of the line search."""
         snes.setObjective(lambda _, x: self._run(energy, x, otherwise=np.nan))
 
     def solve(self, snes: PETSc.SNES, x: PETSc.Vec) -> tuple[int, int]:
-        """Let SNES solve from ``x`` on. Collective.
+        """Solve from ``x`` by SNES. Collective.
 
         Returns:
             Iterations and reason.
 
         Raises:
-            BaseException: The first that a callback raised.
-            MemoryError: The factorisation did not get its memory.
+            BaseException: The first exception raised by a callback.
+            MemoryError: The factorisation ran out of memory.
         """
         try:
             with interrupts_held():
                 snes.solve(None, x)
         finally:
-            self._last = ()  # another solution may be of other equations
+            self._last = ()  # the next solution may have other equations
             error, self._error = self._error, None
             try:
                 if error is not None:
                     raise error
             finally:
-                del error  # it keeps this frame, which would keep it and all that solves
+                del error  # its traceback refers to this frame, which refers to the solvers
         dense.raise_stored_error(snes.getKSP())
         reason, pc = snes.getConvergedReason(), snes.getKSP().getPC()
-        refused = reason <= 0 and self._comm.allreduce(linear.refused_memory(pc))
+        out_of_memory = reason <= 0 and self._comm.allreduce(linear.refused_memory(pc))
         linear.forget_failure(pc)
-        if refused:
+        if out_of_memory:
             raise MemoryError(
                 "out of memory in a factorisation: use more ranks, linear_solver='multigrid', or "
                 "a coarser mesh; if options limit MUMPS, raise the limit (mat_mumps_icntl_14, "
@@ -178,10 +178,7 @@ class Callbacks:
             self._last = x.array_r.copy(), f.array_r.copy()
 
     def _is_last(self, x: PETSc.Vec) -> bool:
-        """Whether the residual was computed last at just this x. Collective.
-
-        Line searches ask for it once more at the step that they take, `cp` half of all times.
-        """
+        """Return whether the last residual is that of x, as after a line search. Collective."""
         same = bool(self._last) and np.array_equal(x.array_r, self._last[0])
         return bool(self._comm.allreduce(not same) == 0)
 

@@ -1,11 +1,10 @@
-"""Continuation in the stiffness of contact: softer problems first, each the start of the next.
+"""Continuation in the contact stiffness: solutions with increasing stiffness.
 
-Newton's method finds the solution of soft contact from far away, and that of stiff contact from the
-solution of one that is a little softer: the points that are closed, stick and slip are nearly those
-of the next one, and for a given status the equations are linear, or nearly so. Where a step of the
-stiffness does not succeed, a smaller one may. Soft contact that has no solution says nothing of
-stiffer contact, which given displacements squeeze more: it is passed over. A start that is as near
-to the solution as that of a softer problem would be is not softened.
+Newton's method converges for a low stiffness from a distant start, and for a higher one from the
+solution of the previous stiffness, whose active set is nearly the same; for a given active set the
+equations are (nearly) linear. After a failure the factor of the stiffness is reduced. A failure
+before any solution raises the stiffness, since prescribed displacements may need more contact
+force. A start with the residual of a softer problem is solved at full stiffness first.
 """
 
 from __future__ import annotations
@@ -21,80 +20,76 @@ __all__ = ["Continuation"]
 
 logger = logging.getLogger("fenics_contact")
 
-# Iterations for one stiffness: with 60 in place of 25 none of 142 random scenes on which Newton's
-# method fails was solved in addition, in 1.06 times the iterations.
-_PATIENCE = 25
-# Halvings of a step before what is left of it is taken, as nothing else follows. Newton's method as
-# the first one does better to fail at once: with this rule for it, too, random scenes with 30 times
-# the stiffness took 1747 iterations for 824.
-_HALVINGS = 4
-# Factor of the stiffness from one problem to the next, and the least that is tried.
-_FACTOR = 10.0
-_LEAST_FACTOR = 1.2
-# Iterations in all before it is given up; what it solves takes 600 at most.
-_MAX_ITERATIONS = 1000
-# Residual of the softer problems, as a share of the forces: they are starts, not results.
-_COARSE = 1e-3
+# Per stiffness: 60 solved no more of 142 random scenes on which Newton's method fails, with 1.06
+# times the iterations.
+_MAX_ITERATIONS_EACH = 25
+# Halvings after which a step is taken, as no method follows. Newton's method as the first one fails
+# instead: with this rule random scenes of 30 times the stiffness took 1747 iterations, not 824.
+_MAX_HALVINGS = 4
+# Factor of the stiffness between solutions, initial and least.
+_INITIAL_FACTOR = 10.0
+_MIN_FACTOR = 1.2
+_MAX_ITERATIONS = 1000  # of all stiffnesses; successful continuations need 600 at most
+_SOFT_RTOL = 1e-3  # relative residual of the softer problems
 
 
 class Continuation(StandaloneMethod):
-    """The method.
+    """Continuation in the contact stiffness.
 
     Attributes:
-        snes: Newton's method for one stiffness, prefix "continuation_" behind the problem's.
-        by_newton: Whether there was a solution the last time.
+        snes: Newton's method for one stiffness; its prefix ends in "continuation_".
+        is_newton_solution: Whether the last solution has converged.
     """
 
     def __init__(self, context: SolverContext) -> None:
         self._equations = context.equations
-        self._newton = context.newton("continuation_", {"snes_max_it": _PATIENCE})
-        self._newton.most_halvings = _HALVINGS
+        self._newton = context.newton("continuation_", {"snes_max_it": _MAX_ITERATIONS_EACH})
+        self._newton.max_halvings = _MAX_HALVINGS
         self.snes = self._newton.snes
-        self.by_newton = False
-        self._whole: list[float] = []  # of each contact
+        self.is_newton_solution = False
+        self._full_stiffness: list[float] = []  # factor of each contact
 
     def solve(self) -> tuple[int, int]:
-        """See `Method.solve`. Iterations are those of all stiffnesses."""
+        """Solve with increasing stiffness; the iterations are those of all stiffnesses."""
         equations = self._equations
         self._newton.attach(consistent=True)
-        self._whole = [float(c.inputs.stiffness_factor.value) for c in equations.contacts]
-        # Softer than it is in any case: Newton's method alone is what failed.
-        soft = 1.0 / max(equations.stiffness_ratio(), _FACTOR)
-        # From a start as near as they are solved to, softer problems only lead away.
+        self._full_stiffness = [float(c.inputs.stiffness_factor.value) for c in equations.contacts]
+        # Softer in any case, since Newton's method has failed at full stiffness.
+        soft = 1.0 / max(equations.stiffness_ratio(), _INITIAL_FACTOR)
         equations.residual(equations.solution, equations.function)
-        near = equations.solved(_COARSE)
-        share = 1.0 if near else soft
-        iterations, solved, factor, kept = 0, 0.0, _FACTOR, equations.solution.copy()
+        near = equations.solved(_SOFT_RTOL)
+        ratio = 1.0 if near else soft
+        iterations, solved, factor, last = 0, 0.0, _INITIAL_FACTOR, equations.solution.copy()
         try:
             while iterations <= _MAX_ITERATIONS:
-                self._soften(share)
+                self._set_stiffness(ratio)
                 equations.monitor.reset()
-                made, reason = self._newton.solve()
-                iterations += made
-                self.by_newton = reason > 0
-                if share == 1.0 and (reason > 0 or not (near or solved)):
+                n_iterations, reason = self._newton.solve()
+                iterations += n_iterations
+                self.is_newton_solution = reason > 0
+                if ratio == 1.0 and (reason > 0 or not (near or solved)):
                     return iterations, reason
                 if reason > 0:
-                    logger.debug("%.3g of the stiffness, %d iterations so far", share, iterations)
-                    solved = share
-                    equations.solution.copy(kept)
+                    logger.debug("%.3g of the stiffness, %d iterations so far", ratio, iterations)
+                    solved = ratio
+                    equations.solution.copy(last)
                 else:
-                    kept.copy(equations.solution)
+                    last.copy(equations.solution)
                     if solved:
                         factor = np.sqrt(factor)
-                if factor < _LEAST_FACTOR:
+                if factor < _MIN_FACTOR:
                     return iterations, reason
                 if near:
-                    near, share = False, soft
+                    near, ratio = False, soft
                 else:
-                    share = min(1.0, factor * (solved or share))
+                    ratio = min(1.0, factor * (solved or ratio))
             return iterations, int(PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT)
         finally:
-            self._soften(1.0)
-            equations.h0_is_made = False
+            self._set_stiffness(1.0)
+            equations.is_h0_current = False
 
-    def _soften(self, share: float) -> None:
-        """Let the contacts have a share of the stiffness they came with."""
-        for contact, whole in zip(self._equations.contacts, self._whole, strict=True):
-            contact.inputs.stiffness_factor.value = share * whole
-        self._newton.coarse = _COARSE if share < 1.0 else 0.0
+    def _set_stiffness(self, ratio: float) -> None:
+        """Set a fraction of the original stiffness in all contacts."""
+        for contact, factor in zip(self._equations.contacts, self._full_stiffness, strict=True):
+            contact.inputs.stiffness_factor.value = ratio * factor
+        self._newton.coarse_rtol = _SOFT_RTOL if ratio < 1.0 else 0.0

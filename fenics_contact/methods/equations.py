@@ -1,7 +1,7 @@
-"""What a method sees of a problem: dimensionless equations over a system, and their matrices.
+"""Dimensionless equations of a system, and their matrices, for the solution methods.
 
-Displacements are by the size of the mesh, stiffness by the largest entry of the bulk's diagonal, so
-that the same scene takes the same iterations in any units.
+Displacements are divided by the size of the mesh, stiffness by the largest diagonal entry of the
+bulk, so that the iterations do not depend on the units.
 """
 
 from __future__ import annotations
@@ -28,47 +28,48 @@ from fenics_contact.types import Array
 __all__ = ["Equations"]
 
 
-# An open point keeps this share of its stiffness in H₀: enough that a body held by contact alone
-# stays held when its whole surface is open, too little to be felt as a wrong tangent.
-_OPEN_SHARE = 1e-3
-# The least share with which a tangent is regularised: on a mode without any force nothing is left.
-_LEAST_SHARE = 1e-6
+# Stiffness of open points in H₀ by that of closed ones: constrains a body whose contact is open.
+_OPEN_STIFFNESS_RATIO = 1e-3
+# Contact force on a mode by the load, below which the mode counts as unloaded.
+_UNLOADED_FORCE_RATIO = 1e-3
+# Least regularisation of a mode, which may have no unbalanced force.
+_MIN_REGULARISATION_RATIO = 1e-6
 
 
 class Equations:
-    """Residual, energy and matrices at a state that a method asks for.
+    """Residual, energy and matrices at the states of a method.
 
     Args:
-        alpha: Share of the normal stiffness in H₀.
-        phi: Share of the tangential stiffness of sticking points in H₀.
+        alpha: Fraction of the normal stiffness in H₀.
+        phi: Fraction of the tangential stiffness of sticking points in H₀.
 
     Attributes:
         full: The system on all unknowns.
-        system: The one that is iterated on, `full` or one condensed.
+        system: The system that is solved, `full` or a condensed one.
         contacts: The contacts.
-        motions: Rigid motions of the bodies.
-        length: What displacements are divided by.
-        watch: What becomes of the status of the points from iteration to iteration.
-        norms: Norms where `residual` was computed last.
+        motions: Rigid-body modes of the bodies.
+        length: Reference length of the displacements.
+        monitor: Monitor of the active set.
+        norms: Norms of the last `residual`.
         start: Forces at the beginning of the increment.
-        began: State of `full` there.
-        has_round_off: Whether a matrix was assembled in this increment, which tells the round-off
-            of its residuals.
-        rtol: Residual that ends the whole solution, as a share of the forces.
-        augmentation_rtol: That of the present round of multipliers, if larger.
-        solution: The state to start from and, after a method, the one found; dimensionless.
-        function: For the residual.
+        initial_unknowns: State of `full` at the beginning of the increment.
+        is_round_off_known: Whether a matrix was assembled in this increment, which determines the
+            round-off of its residuals.
+        rtol: Residual by the forces at which the solution has converged.
+        augmentation_rtol: Tolerance of the solution before the next augmentation, if larger.
+        solution: Dimensionless initial guess and, after a method, solution.
+        function: Vector for the residual.
         solvers: Linear solvers for H₀ (False) and the consistent tangent (True).
-        filled: Which of their matrices hold anything, and not that of another state.
-        h0_is_made: Whether that of H₀ is what `make_h0` made, or made of the status since; False
-            lets it be made before its next use.
-        by_cycle: Whether H₀ is a V-cycle, which serves for its matrix as for the tangent.
+        valid_matrices: Which of their matrices are assembled for a present state.
+        is_h0_current: Whether H₀ is that of `assemble_h0` or of a later status; if False, it is
+            assembled before its next use.
+        uses_v_cycle: Whether H₀ is a multigrid V-cycle, with one matrix for H₀ and the tangent.
         hierarchy: Its levels.
-        factorisations: Of sparse matrices, counted.
-        loads: The largest generalised force of the load on rigid-body modes, (n_groups,) (force).
-        regularised_modes: Rigid-body modes along which the consistent tangent assembled last is
-            regularised, in all motions, (n_modes, n_motions).
-        overload: By what the load outdoes friction, where a method has found that it does.
+        factorisations: Number of sparse factorisations.
+        generalised_loads: Largest generalised load on rigid-body modes, (n_groups,) (force).
+        regularised_modes: Modes along which the last consistent tangent is regularised,
+            (n_modes, n_motions).
+        overload: Overload of friction found by a method.
     """
 
     def __init__(
@@ -79,77 +80,77 @@ class Equations:
         self._bulk, self._comm = full.bulk, full.unknowns.comm
         self._alpha, self._phi = alpha, phi
         self.monitor = ActiveSetMonitor(full.contacts)
-        nothing: Array = np.zeros(full.n_bodies)
-        self.norms = Norms(nothing, nothing, nothing, nothing, nothing.size)
-        self.start = InitialForces(nothing, np.zeros((len(full.contacts), full.n_bodies)))
+        zeros: Array = np.zeros(full.n_bodies)
+        self.norms = Norms(zeros, zeros, zeros, zeros, zeros.size)
+        self.start = InitialForces(zeros, np.zeros((len(full.contacts), full.n_bodies)))
         self.rtol = self.augmentation_rtol = 0.0
         self.solvers: dict[bool, PETSc.KSP] = {}
-        self.by_cycle, self.hierarchy = False, Hierarchy()
+        self.uses_v_cycle, self.hierarchy = False, Hierarchy()
         self.factorisations = 0
-        self.loads: Array = np.zeros(full.scales.n_groups)
+        self.generalised_loads: Array = np.zeros(full.scales.n_groups)
         self.regularised_modes: Array = np.zeros((0, 0))
         self.overload: Overload | None = None
         self._matrices: dict[bool, PETSc.Mat] = {}
-        self.filled: set[bool] = set()
-        self.h0_is_made = False
+        self.valid_matrices: set[bool] = set()
+        self.is_h0_current = False
         self.system: System = full
         self.initial_unknowns = full.state()
-        self.has_round_off = False
+        self.is_round_off_known = False
         self.solution, self.function = full.vector(), full.vector()
 
-    def take(self, system: System) -> None:
-        """Iterate on a system from now on. Collective."""
+    def set_system(self, system: System) -> None:
+        """Set the system to solve. Collective."""
         self.system = system
         self.solution, self.function = system.vector(), system.vector()
 
     # ---- at a state ------------------------------------------------------------------------------
 
     def set_state(self, x: PETSc.Vec) -> None:
-        """Make a dimensionless state the present one, prescribed values apart. Collective."""
+        """Set a dimensionless state, except for prescribed values. Collective."""
         state = x.array_r * self.length
-        # A V-cycle moves the prescribed unknowns too, which nothing would bring back.
+        # A V-cycle also changes prescribed unknowns.
         state[self.system.constrained] = self.system.prescribed
         self.system.set_state(state)
 
     def residual(self, x: PETSc.Vec, f: PETSc.Vec) -> Norms:
-        """Compute the residual at ``x`` into ``f``, and its norms, kept too. Collective.
+        """Compute the residual at ``x`` into ``f``, and its norms. Collective.
 
-        It is not a number where cells are turned inside out, obstacles have turned too far, Γc has
-        no tangent plane, or bodies are ejected.
+        The residual is NaN if cells are inverted, obstacles have rotated too far, Γc has no tangent
+        plane, or bodies are ejected.
         """
         self.set_state(x)
         contacts = self.system.contact_forces()
         total = sum(contacts, self.system.bulk_force())
         system = self.system
-        # Newton's method would end there: nothing acts on such a body.
+        # No force acts on an ejected body: Newton's method would converge there.
         ejected = system is self.full and find_ejected_bodies(
             self.full, self.motions, contacts, self.initial_unknowns, self.start
         )
         if ejected or self._bulk.is_inverted() or system.is_twisted() or system.is_degenerate():
             total[:] = np.nan  # a line search takes a shorter step
         self.norms = self.system.norms(total, contacts, self.start)
-        # No line search is to follow the round-off of a stiff body beside what is left on others.
-        # It is known once a matrix was assembled: before, a run taken up again has none.
-        left_out = self.norms.is_round_off & self.has_round_off
+        # The line search must not follow the round-off of a stiff body. After a restart it is
+        # unknown until a matrix is assembled.
+        left_out = self.norms.is_round_off & self.is_round_off_known
         self.norms = self.norms.without(left_out)
         total[self.system.constrained | left_out[self.system.label]] = 0.0
         f.array[:] = total / (self._bulk.scale * self.length)
         return self.norms
 
     def residual_at(self, state: Array) -> float:
-        """Norm of the residual at a state of the system, left in ``function``. Collective."""
+        """Compute the residual at a state of the system in ``function``; its norm. Collective."""
         self.solution.array[:] = state / self.length
         return self.residual(self.solution, self.function).total
 
     def energy(self, x: PETSc.Vec) -> float:
-        """Potential of a linear bulk and contacts at ``x``. Collective."""
+        """Compute the dimensionless potential of linear bulk and contacts at ``x``. Collective."""
         self.set_state(x)
         energy = self.system.bulk_energy() + sum(c.energy() for c in self.contacts)
         total = float(global_sum(self._comm, energy))
         return total / (self._bulk.scale * self.length**2)
 
     def energy_size(self) -> float:
-        """Size of the terms that `energy` sums up at the present state. Collective."""
+        """Sum the absolute values of the terms of `energy` at the present state. Collective."""
         state = self.system.state()
         size = float(np.abs(self.system.terms(state) * state).sum())
         size += float(np.abs(self.system.load * state).sum())
@@ -157,12 +158,12 @@ class Equations:
         return total / (self._bulk.scale * self.length**2)
 
     def solved(self, rtol: float = 0.0) -> bool:
-        """Whether the residual computed last ends the present round, or is below ``rtol``."""
+        """Return whether the last residual is within the present tolerance, or ``rtol``."""
         return self.norms.within(max(self.rtol, self.augmentation_rtol, rtol))
 
     def find_overload(self) -> Overload | None:
-        """See `find_overload`, by the pressures evaluated last; of linear bodies. Collective."""
-        if not self._bulk.linear:  # a deformation may turn the loads on another, and what holds it
+        """Find an overload of friction at the last pressures, for a linear bulk. Collective."""
+        if not self._bulk.linear:  # a deformation may change loads and constraints of other bodies
             return None
         return find_overload(self.motions, self.full.operators, self.full.load)
 
@@ -170,153 +171,153 @@ class Equations:
 
     @property
     def has_potential(self) -> bool:
-        """Whether every contact law has one."""
+        """Whether every contact law has a potential."""
         return all(c.effective_law.has_potential for c in self.contacts)
 
-    def symmetric(self, consistent: bool) -> bool:
-        """Whether the matrix of H₀, or of the consistent tangent, is."""
+    def is_symmetric(self, consistent: bool) -> bool:
+        """Return whether the matrix of H₀, or of the consistent tangent, is symmetric."""
         return self._bulk.symmetric and (not consistent or self.has_potential)
 
     def matrix(self, consistent: bool) -> PETSc.Mat:
-        """The matrix of H₀ or of the consistent tangent, made when first needed. Collective."""
+        """Return the matrix of H₀ or of the consistent tangent, created on demand. Collective."""
         if consistent not in self._matrices:
-            symmetric = self.symmetric(consistent or self.by_cycle)
+            symmetric = self.is_symmetric(consistent or self.uses_v_cycle)
             matrix = self.system.matrix(symmetric=symmetric)
             self.system.prepare(self.solvers[consistent], matrix)
             self._matrices[consistent] = matrix
         return self._matrices[consistent]
 
     def forget_matrices(self) -> None:
-        """Drop the matrices of H₀ and of the consistent tangent. Collective."""
-        self._matrices, self.filled, self.hierarchy = {}, set(), Hierarchy()
+        """Delete the matrices of H₀ and of the consistent tangent. Collective."""
+        self._matrices, self.valid_matrices, self.hierarchy = {}, set(), Hierarchy()
         for ksp in self.solvers.values():
             ksp.reset()
-        self.h0_is_made = False
+        self.is_h0_current = False
 
-    def make_h0(self, *, everywhere: bool) -> None:
-        """K + αK_n + φK_t of a symmetric H₀ (section 5); see `stiffnesses`. Collective."""
+    def assemble_h0(self, *, everywhere: bool) -> None:
+        """Assemble the symmetric H₀ = K + αK_n + φK_t (section 5), by `stiffnesses`. Collective."""
         self.assemble(self.matrix(False), self.stiffnesses(everywhere=everywhere))
-        self.h0_is_made = True
+        self.is_h0_current = True
 
     def assemble(self, matrix: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> None:
-        """Bulk tangent plus contact, conditions applied, dimensionless. Collective.
+        """Assemble bulk tangent and contact matrices, with Dirichlet conditions. Collective.
 
         Args:
-            matrix: What to fill.
-            contacts: Contact's part, used up.
+            matrix: The matrix, dimensionless.
+            contacts: Matrices of the contacts, destroyed.
         """
         filled = {c for c, m in self._matrices.items() if m.handle == matrix.handle}
-        if True in filled:  # unless ``contacts``, made while the matrix is filled, are regularised
+        if True in filled:  # reset before the generator ``contacts`` may set them
             self.regularised_modes = np.zeros((0, 0))
         self.factorisations += self.system.fill(matrix, contacts)
-        self.has_round_off = True
+        self.is_round_off_known = True
         if self.system.pattern_changes:
-            # A factorisation of another pattern is no start, whatever the matrix says, and levels
-            # do not follow: there may be other unknowns in contact, too.
+            # Neither a factorisation nor multigrid levels can be reused for another pattern.
             self.hierarchy = Hierarchy()
             for consistent in filled:
                 self.solvers[consistent].reset()
                 self.solvers[consistent].setOperators(matrix)
-        self.filled |= filled
-        if self.by_cycle and False in filled:
+        self.valid_matrices |= filled
+        if self.uses_v_cycle and False in filled:
             stiffness, operators = self.full.stiffness, self.full.operators
             assert stiffness is not None
             self.hierarchy.follow(self.solvers[False], matrix, stiffness, operators)
 
     def assemble_tangent(self, x: PETSc.Vec, matrix: PETSc.Mat, *, trial: bool = False) -> None:
-        """The consistent tangent of bulk and contact at ``x``; see `evaluate`. Collective."""
+        """Assemble the consistent tangent at ``x``; ``trial`` as in `evaluate`. Collective."""
         self.evaluate(x, trial=trial)
         self.assemble(matrix, self.regularised_tangents())
 
     def evaluate(self, x: PETSc.Vec, *, trial: bool = False) -> None:
-        """Evaluate bulk and contacts at ``x``, where the residual was computed last. Collective.
+        """Evaluate bulk and contacts at ``x``, the point of the last residual. Collective.
 
         Args:
-            x: Where.
-            trial: Whether that is no iterate: then `watch` does not see it.
+            x: The dimensionless state.
+            trial: Whether ``x`` is not an iterate, so that the monitor does not record it.
         """
         self.set_state(x)
-        if not self._bulk.linear:  # else nothing changes it during a solution
+        if not self._bulk.linear:
             self.full.update_stiffness()
         self.full.evaluate()
         if not trial:
             self.note()
 
     def note(self) -> None:
-        """Let `watch` see the status of the points, evaluated where `norms` are from."""
+        """Record residual and status of the evaluated iterate in the monitor."""
         self.monitor.record(self.norms.total)
 
     def is_constrained(self) -> bool:
-        """Whether the closed points hold all free motions. Collective."""
+        """Return whether the closed points constrain all rigid-body modes. Collective."""
         return self.motions.is_constrained(self.full.operators)
 
     def regularised_tangents(self) -> Iterator[PETSc.Mat]:
-        """`tangents`, regularised where contact leaves a rigid-body mode free. Collective.
+        """Yield consistent tangents, regularised along unconstrained modes. Collective.
 
-        Slipping points of the bodies concerned get the secant stiffness of friction under the
-        present pressure, with which a step along the mode goes as far as they have slipped, by the
-        share of the forces on the mode that is not in balance. Open points get the stiffness with
-        which it closes the nearest gap (`UnconstrainedModes.closing`), where slipping points would
-        not hold the body if they stuck. Open points at which friction acts all the same (a bound
-        that does not depend on the pressure) count as slipping points along Γc. With the residual
-        the regularisation vanishes, and convergence stays superlinear (Levenberg-Marquardt).
+        Slipping points of the bodies get the secant stiffness of friction, weighted by the
+        unbalanced fraction of the forces on the mode: a step along the mode is as long as the slip.
+        Where slipping points would not constrain the body if they stuck, open points get the
+        stiffness with which a step closes the nearest gap (`UnconstrainedModes.closing_stiffness`).
+        Open points with a friction bound independent of the pressure slip. The regularisation
+        vanishes with the residual: convergence remains superlinear (Levenberg-Marquardt).
         """
         full, modes = self.full, self._unconstrained_modes()
-        if modes is None or np.isnan(modes.share).all():
+        if modes is None or np.isnan(modes.imbalance).all():
             self.regularised_modes = np.zeros((0, 0))
             yield from self.tangents()
             return
-        free = ~np.isnan(modes.share)
-        self.regularised_modes = modes.ways @ self.motions.free
-        share = np.where(free, np.maximum(modes.share, _LEAST_SHARE), 0.0)
+        free = ~np.isnan(modes.imbalance)
+        self.regularised_modes = modes.vectors @ self.motions.free
+        imbalance = np.where(free, np.maximum(modes.imbalance, _MIN_REGULARISATION_RATIO), 0.0)
         operators = self.system.operators
         within = [operator.within for operator in operators]
-        closing = modes.closing(self.motions, full.scales, full.operators, within)
-        for number, (operator, close) in enumerate(zip(operators, closing, strict=True)):
+        stiffness = modes.closing_stiffness(self.motions, full.scales, full.operators, within)
+        for number, (operator, closing) in enumerate(zip(operators, stiffness, strict=True)):
             contact, group = operator.contact, full.scales.group_of_points(number)
             values, closed = contact.values, contact.status != Status.OPEN
-            slips = np.where(values.slips, share[group], 0.0)
-            opens = np.where(close < 1.0, close, share[group])
-            opens[closed | ~modes.is_open[group]] = 0.0
-            tangent = contact.effective_law.tangent().scaled(1.0 - slips)
+            slip_ratio = np.where(values.slips, imbalance[group], 0.0)
+            open_ratio = np.where(closing < 1.0, closing, imbalance[group])
+            open_ratio[closed | ~modes.is_open[group]] = 0.0
+            tangent = contact.effective_law.tangent().scaled(1.0 - slip_ratio)
             yield operator.tangent(tangent)
-            normal = opens + np.where(closed, slips, 0.0)
-            tangential = np.where(values.friction_bound > 0, 0.0, opens)
-            tangential += slips * values.friction_secant
+            normal = open_ratio + np.where(closed, slip_ratio, 0.0)
+            tangential = np.where(values.friction_bound > 0, 0.0, open_ratio)
+            tangential += slip_ratio * values.friction_secant
             yield operator.springs(values.springs(normal, tangential))
 
     def _unconstrained_modes(self) -> UnconstrainedModes | None:
-        """Rigid-body modes that contact leaves free at the evaluated state. Collective."""
+        """Find the modes that contact leaves unconstrained at the evaluated state. Collective."""
         full, motions = self.full, self.motions
         if not len(motions.free):
             return None
-        # Of a body that was positioned round-off closes some of many points.
-        idle = full.contact_force_sizes() < _OPEN_SHARE * self.loads
-        first = self.monitor.initial_tractions or [c.values.total_traction for c in self.contacts]
-        return UnconstrainedModes.find(motions, full.scales, full.operators, full.load, first, idle)
+        # Round-off closes some of many points of an initially positioned body.
+        unloaded = full.contact_force_sizes() < _UNLOADED_FORCE_RATIO * self.generalised_loads
+        initial = self.monitor.initial_tractions or [c.values.total_traction for c in self.contacts]
+        return UnconstrainedModes.find(
+            motions, full.scales, full.operators, full.load, initial, unloaded
+        )
 
     def tangents(self) -> Iterator[PETSc.Mat]:
-        """Consistent tangents of the contacts, which are evaluated. Collective."""
+        """Yield the consistent tangents of the evaluated contacts. Collective."""
         return (operator.tangent() for operator in self.system.operators)
 
     def stiffnesses(self, *, everywhere: bool) -> Iterator[PETSc.Mat]:
-        """The shares αK_n + φK_t of the contacts, as evaluated.
+        """Yield αK_n + φK_t of the evaluated contacts.
 
         Args:
-            everywhere: Take all of Γc as closed and sticking, as the paper does, where nothing
-                can be told from the status.
+            everywhere: Whether all of Γc counts as sticking, as in the paper, if the active set is
+                unknown.
         """
         for operator in self.system.operators:
             contact = operator.contact
             normal = tangential = np.ones(contact.quadrature.n_points)
             if not everywhere:
-                normal = np.where(contact.status != Status.OPEN, 1.0, _OPEN_SHARE)
-                tangential = np.where(contact.status == Status.STICK, 1.0, _OPEN_SHARE)
+                normal = np.where(contact.status != Status.OPEN, 1.0, _OPEN_STIFFNESS_RATIO)
+                tangential = np.where(contact.status == Status.STICK, 1.0, _OPEN_STIFFNESS_RATIO)
             springs = contact.values.springs(self._alpha * normal, self._phi * tangential)
             yield operator.springs(springs)
 
     def stiffness_ratio(self) -> float:
-        """Largest ratio of contact's stiffness to the bulk's at an unknown. Collective."""
+        """Return the largest ratio of contact to bulk stiffness at an unknown. Collective."""
         bulk = self.system.bulk_diagonal()
         added = np.zeros_like(bulk)
         for operator in self.system.operators:
@@ -325,7 +326,7 @@ class Equations:
             added += diagonal.array_r
             part.destroy()
             diagonal.destroy()
-        # The motion of an obstacle has no stiffness.
+        # The rigid motion of an obstacle has no bulk stiffness.
         stiffness = np.append(self.full.scales.stiffness, np.full(self.system.n_bodies, np.inf))
-        felt = (bulk > ROUND_OFF * stiffness[self.system.label]) & ~self.system.constrained
-        return global_max(self._comm, added[felt] / bulk[felt])
+        has_stiffness = (bulk > ROUND_OFF * stiffness[self.system.label]) & ~self.system.constrained
+        return global_max(self._comm, added[has_stiffness] / bulk[has_stiffness])

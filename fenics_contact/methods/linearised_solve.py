@@ -1,4 +1,4 @@
-"""The equations linearised about a solution: what more load or traction would change."""
+"""Linearised equations at a solution: response to additional loads or tractions."""
 
 from __future__ import annotations
 
@@ -13,52 +13,49 @@ from fenics_contact.methods.equations import Equations
 from fenics_contact.systems import dense, linear
 from fenics_contact.types import Array
 
-__all__ = ["linearised", "respond"]
+__all__ = ["linearised_solver", "solve_response"]
 
-
-# Residual to which systems near the one factored last are solved.
-_NEARBY = 1e-4
-# Residual with which they are not solved at all.
-_ROUGHLY = 1e-2
+# Relative tolerance of systems preconditioned by the last factorisation; residual of a failure.
+_RESPONSE_RTOL, _FAILED_RTOL = 1e-4, 1e-2
 
 
 @contextmanager
-def linearised(
+def linearised_solver(
     equations: Equations, springs: Sequence[Array], *, prescribed: Array | None = None
 ) -> Iterator[Callable[[Sequence[Array] | None], Array]]:
-    """Solve with the bulk's tangent and given springs on Γc, about the present state.
+    """Solve with the bulk's tangent and given springs on Γc at the present state. Collective.
 
-    Collective. It takes the matrix of the consistent tangent.
+    The matrix of the consistent tangent is overwritten.
 
     Args:
-        equations: At a complete state.
+        equations: The equations at a complete state.
         springs: Stiffness at the points of every contact, (n_points, gdim, gdim) each
             (stress/length).
-        prescribed: By how much prescribed values are still to change, 0 elsewhere, over all
-            unknowns, on which the system has to be (length); None: they have their new values.
+        prescribed: Remaining change of the prescribed values, 0 elsewhere, over all unknowns of the
+            full system (length); None: they have their new values.
 
     Yields:
-        See `ContactProblem.linearised`; changes are without ``prescribed``.
+        The solver, as in `ContactProblem.linearised`; its solutions exclude ``prescribed``.
     """
     system = equations.system
-    right, left = system.vector(), system.vector()
-    ksp = PETSc.KSP().create(right.comm)
+    rhs, solution = system.vector(), system.vector()
+    ksp = PETSc.KSP().create(rhs.comm)
 
     def solve(tractions: Sequence[Array] | None) -> Array:
-        right.set(0.0)
+        rhs.set(0.0)
         if tractions is None:
-            right.array[:] = system.bulk_force() + system.contact_force()
+            rhs.array[:] = system.bulk_force() + system.contact_force()
             if prescribed is not None:
                 assert equations.full.stiffness is not None
-                left.array[:] = prescribed
-                equations.full.stiffness.multAdd(left, right, right)
+                solution.array[:] = prescribed
+                equations.full.stiffness.multAdd(solution, rhs, rhs)
         else:
             for operator, traction in zip(system.operators, tractions, strict=True):
-                operator.add_force(right, traction)
-        right.array[system.constrained] = 0.0
-        right.scale(-1.0 / system.bulk.scale)
+                operator.add_force(rhs, traction)
+        rhs.array[system.constrained] = 0.0
+        rhs.scale(-1.0 / system.bulk.scale)
         with interrupts_held():
-            ksp.solve(right, left)
+            ksp.solve(rhs, solution)
         dense.raise_stored_error(ksp)
         if ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
             raise ValueError(
@@ -71,13 +68,13 @@ def linearised(
                 "the linearised problem at the solution did not converge (KSP reason "
                 f"{ksp.getConvergedReason()}); use linear_solver='direct'"
             )
-        return system.extended(left.array_r.copy())
+        return system.extended(solution.array_r.copy())
 
     try:
         matrices = (o.springs(s) for o, s in zip(system.operators, springs, strict=True))
         equations.assemble(equations.matrix(True), matrices)
-        # The tangent's own solver may be a V-cycle and no more; after a factorisation GMRES ends
-        # with its first iteration.
+        # The solver of the tangent may be one V-cycle; with a factorisation GMRES takes one
+        # iteration.
         ksp.setOperators(equations.matrix(True))
         ksp.setType(PETSc.KSP.Type.GMRES)
         ksp.setPC(equations.solvers[True].getPC())
@@ -85,64 +82,64 @@ def linearised(
         yield solve
     finally:
         linear.forget_failure(equations.solvers[True].getPC())
-        for item in (ksp, right, left):
+        for item in (ksp, rhs, solution):
             item.destroy()
 
 
-def respond(
+def solve_response(
     equations: Equations,
     springs: Sequence[Array],
     tractions: Sequence[Array],
     *,
     consistent: bool,
 ) -> list[Array]:
-    """Changes of the relative displacements at the points of every contact. Collective.
+    """Compute approximate changes of the jump at the points of every contact. Collective.
 
-    To some digits: with a matrix factored before, which is the tangent near the solution.
+    The preconditioner is a matrix factored before, near the tangent of the solution.
 
     Args:
-        equations: At a solution.
+        equations: The equations at a solution.
         springs: Stiffness at the points of every contact, (n_points, gdim, gdim) each
             (stress/length).
-        tractions: What is added on the body, (n_points, gdim) each (stress).
-        consistent: Whether the matrix is that of the consistent tangent, or else of H₀.
+        tractions: Additional tractions on the body, (n_points, gdim) each (stress).
+        consistent: Whether the factored matrix is the consistent tangent, not H₀.
     """
     system = equations.system
-    right, left, diagonal = system.vector(), system.vector(), system.diagonal
+    rhs, solution, diagonal = system.vector(), system.vector(), system.diagonal
     matrix = system.matrix(symmetric=False)
-    ksp = PETSc.KSP().create(right.comm)
+    ksp = PETSc.KSP().create(rhs.comm)
     try:
-        if consistent not in equations.filled:  # nothing was iterated yet
+        if consistent not in equations.valid_matrices:  # before the first iteration
             equations.assemble(equations.matrix(consistent), equations.tangents())
         parts = (o.springs(k) for o, k in zip(system.operators, springs, strict=True))
         system.fill(matrix, parts)
         for operator, traction in zip(system.operators, tractions, strict=True):
-            operator.add_force(right, traction)
-        right.array[system.constrained] = 0.0
-        right.scale(-1.0 / system.bulk.scale)
+            operator.add_force(rhs, traction)
+        rhs.array[system.constrained] = 0.0
+        rhs.scale(-1.0 / system.bulk.scale)
         ksp.setOperators(matrix)
         ksp.setType(PETSc.KSP.Type.FGMRES)
         ksp.getPC().setType("python")
-        ksp.getPC().setPythonContext(_Nearby(equations.solvers[consistent]))
-        ksp.setTolerances(rtol=_NEARBY, max_it=100)
-        ksp.solve(right, left)
+        ksp.getPC().setPythonContext(_FactoredPreconditioner(equations.solvers[consistent]))
+        ksp.setTolerances(rtol=_RESPONSE_RTOL, max_it=100)
+        ksp.solve(rhs, solution)
         dense.raise_stored_error(equations.solvers[consistent])
-        if ksp.getResidualNorm() > _ROUGHLY * right.norm():
-            left.set(np.nan)  # nothing is known
-        return [operator.jump(left.array_r) for operator in system.operators]
+        if ksp.getResidualNorm() > _FAILED_RTOL * rhs.norm():
+            solution.set(np.nan)
+        return [operator.jump(solution.array_r) for operator in system.operators]
     finally:
         system.diagonal = diagonal
-        for item in (ksp, matrix, right, left):
+        for item in (ksp, matrix, rhs, solution):
             item.destroy()
 
 
-class _Nearby:
-    """A preconditioner: the solver of a matrix that differs by the status of some points."""
+class _FactoredPreconditioner:
+    """Preconditioner by the solver of a matrix with another active set."""
 
     def __init__(self, ksp: PETSc.KSP) -> None:
         ksp.setUp()
         self._pc = ksp.getPC()
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """For PETSc."""
+        """Apply the preconditioner."""
         self._pc.apply(x, y)

@@ -1,7 +1,7 @@
-"""Whether admissible contact forces can balance a load, before any iteration.
+"""Necessary conditions for equilibrium, before any iteration.
 
-A body that contact alone holds is ordinary. One that nothing will ever hold, or a load that pulls
-it off its obstacle, has no solution.
+Rigid-body modes must be constrained, and admissible contact forces must be able to balance the load
+on them.
 """
 
 from __future__ import annotations
@@ -21,14 +21,12 @@ from fenics_contact.types import Array, Index
 
 __all__ = ["check_balance", "find_free_modes", "unbalanced"]
 
-# Generalised forces relative to the largest that the load could exert, and entries of unit modes at
-# the points, that are zero.
-_BALANCED, _FELT = 1e-8, 1e-10
-# Directions by which the friction cone is enclosed in space: a polygon around the circle, so that a
-# balance that exists is never denied.
+# Zero generalised force by the largest of the load, and zero entry of unit modes at the points.
+_ZERO_FORCE_RATIO, _ZERO_MODE = 1e-8, 1e-10
+# Sides of the circumscribed polygon of the friction cone in space, which excludes no equilibrium.
 _CONE_SIDES = 64
-# As many of these, of all points and directions alike, nearly always balance what all of them do.
-_SOME_RAYS = 2000
+# A uniform sample of so many rays nearly always suffices.
+_MAX_SAMPLED_RAYS = 2000
 
 
 def find_free_modes(modes: RigidBodyModes, full: FullSystem) -> None:
@@ -36,17 +34,17 @@ def find_free_modes(modes: RigidBodyModes, full: FullSystem) -> None:
 
     Args:
         modes: The modes.
-        full: The system on all unknowns, its contacts evaluated.
+        full: The system on all unknowns, with evaluated contacts.
 
     Raises:
-        ValueError: No contact resists one of them, even if all of Γc were closed; it names it.
+        ValueError: A mode is unconstrained even if all of Γc is closed.
     """
     with full.stiffness_at_rest() as stiffness:
         full.scales.measure_stiffness(stiffness)
         modes.find_free(stiffness, full.constrained)
-    loose = modes.unconstrained(full.operators, closed_only=False) @ modes.free
-    if loose.size:
-        motions = "; ".join(modes.describe(row) for row in loose)
+    unconstrained = modes.unconstrained(full.operators, closed_only=False) @ modes.free
+    if unconstrained.size:
+        motions = "; ".join(modes.describe(row) for row in unconstrained)
         finite = any(contact.finite for contact in full.contacts)
         order = " to first order" if finite else ""
         raise ValueError(
@@ -57,49 +55,48 @@ def find_free_modes(modes: RigidBodyModes, full: FullSystem) -> None:
 
 
 def check_balance(modes: RigidBodyModes, load: Array, operators: Sequence[ContactOperator]) -> None:
-    """Refuse a load whose resultant no admissible contact forces can balance. Collective.
+    """Check that admissible contact forces can balance the resultant of the load. Collective.
 
-    The contact may push anywhere on Γc, and rub within the friction cone: a necessary condition
-    only, but it finds a body pulled off its obstacle, tipped over its edge or pushed along it.
-    Bodies that no contact couples are looked at apart.
+    Contact forces within the friction cone may act anywhere on Γc: a necessary condition, which a
+    body violates that is pulled off, tipped over the edge of or pushed along its obstacle. Groups
+    of coupled bodies are separate.
 
     Args:
         modes: The free rigid-body modes.
         load: External forces at this rank's unknowns (force).
-        operators: Of evaluated contacts, over all unknowns.
+        operators: Operators of evaluated contacts, over all unknowns.
 
     Raises:
-        ValueError: It gives the resultant and the mode.
+        ValueError: The load cannot be balanced; with the resultant and the mode.
     """
-    rows = modes.straight()  # arms turn with an obstacle: what it cannot bear here it may there
+    rows = modes.straight()  # lever arms change with the rotation of an obstacle
     resultant, size = modes.load_resultant(load, operators)
     if not resultant.any():
         return
     comm = modes.comm
-    mine = [_admissible_forces(o, modes.at_points(o)[rows]) for o in operators]
-    every = gather_rows(comm, np.concatenate([np.zeros((0, len(rows))), *mine]))
-    felt = (np.abs(every) > _FELT).astype(np.float64)
-    couples = felt.T @ felt + modes.of_same_body()[np.ix_(rows, rows)]
+    local_rays = [_admissible_forces(o, modes.at_points(o)[rows]) for o in operators]
+    all_rays = gather_rows(comm, np.concatenate([np.zeros((0, len(rows))), *local_rays]))
+    acts = (np.abs(all_rays) > _ZERO_MODE).astype(np.float64)
+    couples = acts.T @ acts + modes.of_same_body()[np.ix_(rows, rows)]
     n_groups, label = scipy.sparse.csgraph.connected_components(couples, directed=False)
-    beyond: list[str] = []
+    failures: list[str] = []
     for group in (np.flatnonzero(label == number) for number in range(n_groups)):
         largest = np.abs(resultant[group]).max()
         if largest == 0.0:
             continue
-        direction, rays = -resultant[group] / largest, every[:, group]
-        # Unit columns: a ray's length has no meaning, and badly scaled ones spoil the solution. One
-        # of rounding only, such as of tangential forces on a mode across them, is none.
+        direction, rays = -resultant[group] / largest, all_rays[:, group]
+        # Rays have unit length, for the conditioning; those of round-off are left out.
         length = np.linalg.norm(rays, axis=1)
-        rays = rays[length > _FELT] / length[length > _FELT, None]
-        rest = broadcast_from_root(comm, unbalanced(rays.T, direction)) if len(rays) else 1.0
-        allowed = _BALANCED * max(1.0, size[group].max() / largest)
-        if rest > allowed:
+        rays = rays[length > _ZERO_MODE] / length[length > _ZERO_MODE, None]
+        residual = broadcast_from_root(comm, unbalanced(rays.T, direction)) if len(rays) else 1.0
+        allowed = _ZERO_FORCE_RATIO * max(1.0, size[group].max() / largest)
+        if residual > allowed:
             limits = broadcast_from_root(comm, _largest_forces(rays.T, direction)) + 0.0  # no -0
-            beyond += _describe(modes, rows[group], direction, limits, allowed, largest)
-    if beyond:
+            failures += _describe(modes, rows[group], direction, limits, allowed, largest)
+    if failures:
         raise ValueError(
             "no contact force can balance the load: its resultant along the free motion "
-            f"{', and along '.join(beyond)}. Contact forces are compressive and within the "
+            f"{', and along '.join(failures)}. Contact forces are compressive and within the "
             "friction cone. Check the sign and magnitude of the load, and the normals, "
             "or add a Dirichlet condition"
         )
@@ -108,30 +105,30 @@ def check_balance(modes: RigidBodyModes, load: Array, operators: Sequence[Contac
 def _describe(
     modes: RigidBodyModes,
     rows: Index,
-    wanted: Array,
+    direction: Array,
     limits: Array,
     allowed: float,
     largest: float,
 ) -> list[str]:
-    """What of a resultant, relative to its largest component, contact cannot bear, in words."""
-    named = [modes.describe(modes.free[row]) for row in rows]
-    # NaN: not even the other components can be borne.
-    found = [
+    """Describe the components of a resultant by its largest that contact cannot balance."""
+    names = [modes.describe(modes.free[row]) for row in rows]
+    # A limit is NaN if not even the other components can be balanced.
+    descriptions = [
         f"({name}) is {-largest * force:.6g}, of which contact can balance at most "
         f"{largest * limit:.6g} with the other components unchanged"
-        for name, force, limit in zip(named, wanted, limits, strict=True)
+        for name, force, limit in zip(names, direction, limits, strict=True)
         if abs(force) > limit + allowed
     ]
-    worst = int(np.argmax(np.abs(wanted)))
-    return found or [f"({named[worst]}) is {-largest * wanted[worst]:.6g}"]
+    worst = int(np.argmax(np.abs(direction)))
+    return descriptions or [f"({names[worst]}) is {-largest * direction[worst]:.6g}"]
 
 
 def _admissible_forces(operator: ContactOperator, modes: Array) -> Array:
-    """Generalised forces of every admissible direction at this rank's points, (n_rays, n_modes).
+    """Compute generalised forces of the admissible directions at local points, (n_rays, n_modes).
 
     Args:
-        operator: Of the contact.
-        modes: At its points, (n_modes, n_points, gdim).
+        operator: Operator of the contact.
+        modes: The modes at its points, (n_modes, n_points, gdim).
     """
     contact, values = operator.contact, operator.contact.values
     normal, law = values.normal, contact.law
@@ -139,82 +136,81 @@ def _admissible_forces(operator: ContactOperator, modes: Array) -> Array:
     directions = []
     if law.has_tangential:
         if d == 2:
-            around = [np.column_stack([-normal[:, 1], normal[:, 0]])]
-            around.append(-around[0])
+            tangents = [np.column_stack([-normal[:, 1], normal[:, 0]])]
+            tangents.append(-tangents[0])
         else:
-            around = _around(normal)
+            tangents = _tangential_directions(normal)
         ratio = values.friction_bound_ratio[:, None]
         ratio = ratio if d == 2 else ratio / np.cos(np.pi / _CONE_SIDES)
-        bounded = np.isfinite(ratio)  # by the normal force
-        pushes = -_bearing_normals(contact) * law.has_normal_stiffness
+        bounded = np.isfinite(ratio)
+        pressure = -_stiff_normals(contact) * law.has_normal_stiffness
         directions = [
-            np.where(bounded, pushes + np.where(bounded, ratio, 0.0) * t, t) for t in around
+            np.where(bounded, pressure + np.where(bounded, ratio, 0.0) * t, t) for t in tangents
         ]
     if law.has_normal_stiffness:
-        pushes = -_bearing_normals(contact)
-        directions += [pushes, -pushes] if law.has_tension else [pushes]
+        pressure = -_stiff_normals(contact)
+        directions += [pressure, -pressure] if law.has_tension else [pressure]
     rays = [np.einsum("mqd,qd->qm", modes, direction) for direction in directions]
     return np.concatenate([np.zeros((0, len(modes))), *rays])
 
 
 def unbalanced(rays: Array, resultant: Array) -> float:
-    """The least Σ|resultant - rays·x| over x ≥ 0; rays (n_free, n_rays) of unit length.
+    """Compute min Σ|resultant - rays·x| over x ≥ 0; rays (n_free, n_rays) of unit length.
 
-    Least squares without negatives find at once that there is nothing left, of some of the rays
-    quicker than of all, but where there is they may end far from their optimum: then a linear
-    programme, which takes ten times as long.
+    Non-negative least squares detect zero quickly, but otherwise may end far from the optimum: then
+    a linear programme follows, which takes ten times as long.
     """
     m, n = rays.shape
-    for tried in (rays[:, :: n // _SOME_RAYS + 1], rays):
+    for sample in (rays[:, :: n // _MAX_SAMPLED_RAYS + 1], rays):
         try:
-            forces = scipy.optimize.nnls(tried, resultant)[0]
+            forces = scipy.optimize.nnls(sample, resultant)[0]
         except RuntimeError:
             continue  # too many iterations
-        if np.abs(tried @ forces - resultant).sum() < _BALANCED:
+        if np.abs(sample @ forces - resultant).sum() < _ZERO_FORCE_RATIO:
             return 0.0
     tolerance = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
-    found = scipy.optimize.linprog(
+    solution = scipy.optimize.linprog(
         np.concatenate([np.zeros(n), np.ones(2 * m)]),
         A_eq=np.hstack([rays, np.eye(m), -np.eye(m)]),
         b_eq=resultant,
         options=tolerance,
     )
-    # What the programme cannot tell is left to the solution itself to show.
-    return float(found.fun) if found.status == 0 else 0.0
+    # After a failure of the programme the load is accepted.
+    return float(solution.fun) if solution.status == 0 else 0.0
 
 
-def _largest_forces(rays: Array, wanted: Array) -> Array:
-    """The largest of each component of a force that rays can make, all others as wanted, (n_free,).
+def _largest_forces(rays: Array, force: Array) -> Array:
+    """Maximise each component of a force of the cone with the others prescribed, (n_free,).
 
-    Of the sign that is wanted; NaN where the others alone cannot be made.
+    Each has the sign of ``force``, or is NaN if the others cannot be reached.
 
     Args:
-        rays: (n_free, n_rays) of unit length.
-        wanted: The force, (n_free,).
+        rays: Rays of the cone, (n_free, n_rays), of unit length.
+        force: The prescribed force, (n_free,).
     """
-    found = np.full(len(wanted), np.nan)
+    largest = np.full(len(force), np.nan)
     if not rays.size:
-        return found
-    for i, value in enumerate(wanted):
-        rest = np.where(np.arange(len(wanted)) == i, 0.0, wanted)
-        along = np.zeros((len(wanted), 1))
-        along[i] = -1.0 if value >= 0 else 1.0
+        return largest
+    for i, value in enumerate(force):
+        rest = np.where(np.arange(len(force)) == i, 0.0, force)
+        direction = np.zeros((len(force), 1))
+        direction[i] = -1.0 if value >= 0 else 1.0
         cost = np.append(np.zeros(rays.shape[1]), -1.0)
-        made = scipy.optimize.linprog(cost, A_eq=np.hstack([rays, along]), b_eq=rest)
-        if made.status == 0:
-            found[i] = made.x[-1]
-    return found
+        solution = scipy.optimize.linprog(cost, A_eq=np.hstack([rays, direction]), b_eq=rest)
+        if solution.status == 0:
+            largest[i] = solution.x[-1]
+    return largest
 
 
-def _bearing_normals(contact: Contact) -> Array:
-    """Normals at the points, zero where k_n is: there is no foundation there, (n_points, gdim)."""
+def _stiff_normals(contact: Contact) -> Array:
+    """Return the normals at the points, zero where k_n = 0, (n_points, gdim)."""
     values = contact.values
-    bears = np.asarray(values.parameters.get("k_n", 1.0)) > 0
-    return np.where(bears[..., None], values.normal, 0.0)
+    is_stiff = np.asarray(values.parameters.get("k_n", 1.0)) > 0
+    return np.where(is_stiff[..., None], values.normal, 0.0)
 
 
-def _around(normal: Array) -> list[Array]:
-    """Unit vectors around each normal in space, `_CONE_SIDES` of them."""
+def _tangential_directions(normal: Array) -> list[Array]:
+    """Return `_CONE_SIDES` tangential unit vectors around each normal in space."""
     least = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
     first = np.cross(normal, least)
     first /= np.linalg.norm(first, axis=1, keepdims=True)

@@ -95,7 +95,7 @@ class SolverContext:
             consistent: Whether it is for the consistent tangent, not for H₀.
             with_own: More of them where the linear solver is its own.
         """
-        solver = self.linear_solver(self.equations.symmetric(consistent))
+        solver = self.linear_solver(self.equations.is_symmetric(consistent))
         prefix, defaults = self.prefix + part, self.defaults
         snes = PETSc.SNES().create(self.equations.full.unknowns.comm)
         snes.setOptionsPrefix(prefix)
@@ -117,11 +117,11 @@ class StandaloneMethod(Method):
     a lower residual (`ActiveSetMonitor.n_stalled`), so that the methods that follow get their turn.
 
     Attributes:
-        by_newton: Whether Newton's method found the last solution, so that the consistent tangent
+        is_newton_solution: Whether Newton's method found the last solution, so that the consistent tangent
             is factored near it.
     """
 
-    by_newton = False
+    is_newton_solution = False
 
     @abstractmethod
     def __init__(self, context: SolverContext) -> None:
@@ -162,7 +162,7 @@ class SnesMethod(Method):
         *,
         own_solver: bool = False,
     ) -> None:
-        self.snes, self.gives_up, self.coarse = snes, gives_up, 0.0
+        self.snes, self.gives_up, self.coarse_rtol = snes, gives_up, 0.0
         self._own_solver = own_solver
         self._function: PETSc.Vec | None = None  # of the system it is attached to
         self._equations = equations
@@ -211,7 +211,7 @@ class SnesMethod(Method):
 
     def converged(self) -> int:
         """Why SNES ends here, or that it goes on, as SNES has it."""
-        if self._equations.solved(self.coarse):
+        if self._equations.solved(self.coarse_rtol):
             return int(_REASONS.CONVERGED_FNORM_RELATIVE)
         if self._equations.monitor.n_stalled > _PATIENCE and self.gives_up():
             return int(_REASONS.DIVERGED_LINE_SEARCH)
@@ -222,7 +222,7 @@ class Newton(SnesMethod):
     """Newton's method with the consistent tangent.
 
     Attributes:
-        most_halvings: Of a step that `_level` refuses, before what is left of it is taken: where a
+        max_halvings: Of a step that `_level` refuses, before what is left of it is taken: where a
             point is about to change its status no share of a step need lower anything. Infinite:
             the line search fails.
     """
@@ -239,7 +239,7 @@ class Newton(SnesMethod):
         self._iterate: tuple[PETSc.Vec, PETSc.Vec] | None = None  # and the residual there
         self._step: float | None = None  # norm of the correction there, once it is asked for
         self._trial: Array | None = None  # whose tangent the matrix holds, if not the iterate's
-        self.most_halvings = np.inf
+        self.max_halvings = np.inf
         self._trials = 0  # of the present step
         self._looks_ahead = False  # whether to ask for the correction after a whole step
 
@@ -301,7 +301,7 @@ class Newton(SnesMethod):
             self._trials = 0
             return 1.0
         self._trials += 1
-        if self._trials > self.most_halvings:
+        if self._trials > self.max_halvings:
             return 0.0
         iterate, residual = self._iterate
         if residual.norm() == 0.0:  # what is left is round-off that no step takes away

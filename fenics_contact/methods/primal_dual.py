@@ -65,7 +65,7 @@ class PrimalDual(StandaloneMethod):
         snes: Newton's method, prefix "primal_dual_" behind the problem's.
     """
 
-    by_newton = True
+    is_newton_solution = True
 
     def __init__(self, context: SolverContext) -> None:
         equations = self._equations = context.equations

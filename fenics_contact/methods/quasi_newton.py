@@ -72,7 +72,7 @@ class QuasiNewton(SnesMethod):
         borne = norms.force[norms.n_bodies :].max(initial=0.0)
         idle = borne < _IDLE * norms.total
         # Multigrid follows at once, a factorisation is kept.
-        if equations.by_cycle or not equations.h0_is_made or (idle and self._refreshed):
+        if equations.uses_v_cycle or not equations.is_h0_current or (idle and self._refreshed):
             self._start(idle=idle)
         else:
             self._clear_pairs(consistent=self.consistent)
@@ -117,7 +117,7 @@ class QuasiNewton(SnesMethod):
         self._clear_pairs(consistent=False)
         equations.evaluate(equations.solution)
         self._refreshed = not idle and equations.is_constrained()
-        equations.make_h0(everywhere=not self._refreshed)
+        equations.assemble_h0(everywhere=not self._refreshed)
 
     def _refresh(self) -> bool:
         """Make H₀ anew from the status that the last round reached; False if none. Collective.
@@ -133,7 +133,7 @@ class QuasiNewton(SnesMethod):
         tangent = not equations.has_potential and equations.is_constrained()
         springs = equations.stiffnesses(everywhere=False)
         parts = equations.regularised_tangents() if tangent else springs
-        consistent = tangent and not equations.by_cycle
+        consistent = tangent and not equations.uses_v_cycle
         self._clear_pairs(consistent=consistent)
         equations.assemble(equations.matrix(consistent), parts)
         return True

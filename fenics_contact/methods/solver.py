@@ -21,7 +21,7 @@ from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.augmented_lagrangian import RESIDUAL_ERROR_RATIO, solve_augmented_lagrangian
 from fenics_contact.methods.continuation import Continuation
 from fenics_contact.methods.equations import Equations
-from fenics_contact.methods.linearised_solve import linearised, respond
+from fenics_contact.methods.linearised_solve import linearised_solver, solve_response
 from fenics_contact.methods.load_balance import check_balance
 from fenics_contact.methods.method import (
     Method,
@@ -221,7 +221,7 @@ class Solver:
         solver = self.system.linear_kind
         newton = linear.newton_options(solver)
         options.set(linear.quasi_newton_options(solver) if quasi_newton else newton, prefix)
-        equations.by_cycle = quasi_newton and solver == "multigrid"
+        equations.uses_v_cycle = quasi_newton and solver == "multigrid"
         snes = self.snes = PETSc.SNES().create(self._comm)
         snes.setOptionsPrefix(prefix)
         snes.setType(snes_type)
@@ -233,7 +233,7 @@ class Solver:
             ksp = snes.getKSP() if own else PETSc.KSP().create(self._comm)
             part = prefix + ("tangent_" if consistent else "")
             ksp.setOptionsPrefix(part)
-            symmetric = equations.symmetric(consistent)
+            symmetric = equations.is_symmetric(consistent)
             options.set(
                 self.system.linear_solver(symmetric=symmetric, accurate=not quasi_newton), part
             )
@@ -316,8 +316,8 @@ class Solver:
             wanted=self._settings.linear_solver,
             condensed=self.condensed,
             named=self._named,
-            symmetric=self.equations.symmetric(False),
-            tangent_symmetric=self.equations.symmetric(True),
+            symmetric=self.equations.is_symmetric(False),
+            tangent_symmetric=self.equations.is_symmetric(True),
         )
         if reason and self._comm.rank == 0 and not self.condensed:
             n = self._full.unknowns.first_motion
@@ -338,7 +338,7 @@ class Solver:
                 logger.info("static condensation onto %d of %d unknowns", selection.n_global, n)
         self._pairings = self._present_pairings()
         with self.options.present():
-            self.equations.take(system)
+            self.equations.set_system(system)
 
     def _present_pairings(self) -> list[int]:
         # Matrices of pairs that follow the bodies are made for each anew, and no one is retained.
@@ -414,7 +414,7 @@ class Solver:
 
     def recover(self) -> None:
         """Replace what an error of PETSc may have left locked or half done. Collective."""
-        self.equations.take(self.system)
+        self.equations.set_system(self.system)
         self._make_matrices()
 
     def _make_matrices(self) -> None:
@@ -452,8 +452,8 @@ class Solver:
         """
         equations = self.equations
         equations.start = self.system.initial_forces()
-        equations.has_round_off, equations.overload = False, None
-        equations.loads = equations.motions.generalised_load(self._full.load)
+        equations.is_round_off_known, equations.overload = False, None
+        equations.generalised_loads = equations.motions.generalised_load(self._full.load)
 
         def iterate(first_round: bool) -> tuple[int, list[Attempt]]:
             changed = first_round and stiffness_changed
@@ -490,7 +490,7 @@ class Solver:
             equations.solution.array[:] = start
             equations.monitor.reset()
             if stiffness_changed:
-                equations.h0_is_made = False
+                equations.is_h0_current = False
             iterations, reason = self.methods.get(method, self.main).solve()
             attempts.append(Attempt(method, iterations, self._outcome(reason)))
             if reason > 0:
@@ -500,7 +500,7 @@ class Solver:
                 logger.info("%s", attempts[-1])
         equations.set_state(equations.solution)
         own = self.methods.get(method)
-        newton = self.snes.getType() in _NEWTONS if own is None else own.by_newton
+        newton = self.snes.getType() in _NEWTONS if own is None else own.is_newton_solution
         newton = newton and not isinstance(self.main, QuasiNewton)
         made = sum(attempt.iterations for attempt in attempts[-1:])
         if reason > 0 and newton and (factored or made > 0):
@@ -559,7 +559,7 @@ class Solver:
         self.update_system(self._full.update_stiffness())
         self.predictor.forget()  # the matrix that is about to be used is another one
         self.system.begin(load)
-        return linearised(self.equations, springs)
+        return linearised_solver(self.equations, springs)
 
     def end_without(self, acting: Sequence[tuple[Contact, Mask]], start: Array) -> Array | None:
         """Where the increment would end, to first order, if some points did not act. Collective.
@@ -596,10 +596,10 @@ class Solver:
                     c.values.springs(s, s) for c, s in zip(full.contacts, closed, strict=True)
                 ]
                 self.predictor.forget()  # the matrix that is about to be used is another one
-                with linearised(self.equations, springs, prescribed=moved) as solve:
+                with linearised_solver(self.equations, springs, prescribed=moved) as solve:
                     return present + solve(None)
             finally:
-                self.equations.filled.discard(True)  # it is that of another state
+                self.equations.valid_matrices.discard(True)  # it is that of another state
                 for contact, _ in acting:
                     contact.restrict_to()
                 full.set_state(present)
@@ -608,6 +608,6 @@ class Solver:
 
     def respond(self, springs: Sequence[Array], tractions: Sequence[Array]) -> list[Array]:
         """`neighbourhood.respond`, by the matrix factored last. Collective."""
-        made = self.equations.filled
+        made = self.equations.valid_matrices
         consistent = self.main.consistent or True in made or False not in made
-        return respond(self.equations, springs, tractions, consistent=consistent)
+        return solve_response(self.equations, springs, tractions, consistent=consistent)

@@ -23,7 +23,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
-from fenics_contact.methods.limit_analysis import CLEARLY
+from fenics_contact.methods.limit_analysis import CLEAR_OVERLOAD_FACTOR
 from fenics_contact.methods.method import SnesMethod, SolverContext, StandaloneMethod
 from fenics_contact.types import Array
 
@@ -97,7 +97,7 @@ class TrescaFixedPoint(StandaloneMethod):
                 needed = overload.factor if overload else 1.0
                 overloads = overloads + 1 if 1.0 < needed < np.inf else 0
                 # Limits that the pressure does not set are what they are.
-                enough = 1 if equations.has_potential else 2 if needed > CLEARLY else _OVERLOADS
+                enough = 1 if equations.has_potential else 2 if needed > CLEAR_OVERLOAD_FACTOR else _OVERLOADS
                 if overloads >= enough:
                     logger.debug("%d cycles, %d Newton iterations: overload", cycle, iterations)
                     equations.overload = overload
@@ -125,7 +125,7 @@ class TrescaFixedPoint(StandaloneMethod):
                 bound = bound + relaxation * (self._friction_bound() - bound)
             return iterations, int(_REASONS.DIVERGED_MAX_IT)
         finally:
-            equations.h0_is_made = False
+            equations.is_h0_current = False
             for contact in equations.contacts:
                 contact.effective_law.release_friction_bound()
 
