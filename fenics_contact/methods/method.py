@@ -1,4 +1,4 @@
-"""What a method of solution is: one solution by the main SNES, or by solvers of its own."""
+"""Base classes of the solution methods, and Newton's method."""
 
 from __future__ import annotations
 
@@ -20,48 +20,46 @@ from fenics_contact.types import Array
 
 __all__ = ["Method", "Newton", "SnesMethod", "SolverContext", "StandaloneMethod"]
 
-# Least decrease of the level function along a step. Without any, Newton's method cycled between two
-# states whose levels were 0.93 and 0.96 of each other's; with a quarter (Deuflhard's restricted
-# monotonicity) it does not begin where one point is closed, from which levels fall to 0.83.
-_DECREASE = 0.1
-# Share of a step from which on it is the whole one, and no half: multigrid has it to a hundredth.
-_WHOLE = 0.9
-# Iterations without a lower residual, see `ActiveSetMonitor.n_stalled`, after which another method takes
-# over.
-_PATIENCE = 14
-# What shows how a solver fares; under the problem's own prefix it is for those inside, too.
+# Least decrease of the level function along a step. With 0 Newton's method cycled between states
+# with level ratios of 0.93 and 0.96; with 0.25 (Deuflhard's restricted monotonicity) it fails where
+# one point is closed, with a ratio of 0.83.
+_MIN_LEVEL_DECREASE = 0.1
+# Length of a full step by that of the correction, which multigrid computes to a hundredth.
+_FULL_STEP_RATIO = 0.9
+_MAX_STALLED_ITERATIONS = 14  # `ActiveSetMonitor.n_stalled` at which another method takes over
+# Options with the problem's prefix that also apply to the inner solvers.
 _MONITORS = ("snes_monitor", "snes_linesearch_monitor", "snes_converged_reason", "ksp_monitor")
 
 _REASONS = PETSc.SNES.ConvergedReason
 
 
 class Method(ABC):
-    """A way to solve equations from a start: on the main SNES, or an `StandaloneMethod`."""
+    """A solution method, on the main SNES or a `StandaloneMethod`."""
 
     @classmethod
     def main_options(cls) -> Mapping[str, Any]:
-        """Options of the main SNES; by default none of its own."""
+        """Return default options of the main SNES for this method."""
         return {}
 
     @abstractmethod
     def solve(self) -> tuple[int, int]:
-        """Solve from ``solution`` of the equations on, which becomes what was found. Collective.
+        """Solve the equations from their ``solution``, which is overwritten. Collective.
 
         Returns:
-            Iterations, and the reason as SNES has them (positive: converged).
+            Iterations and SNES reason (positive: converged).
         """
 
 
 @dataclass(frozen=True)
 class SolverContext:
-    """What methods with solvers of their own are made of, and do not keep: it leads to PETSc's.
+    """Data to construct a `StandaloneMethod`, which must not store them (PETSc reference cycles).
 
     Attributes:
-        equations: What to solve.
-        defaults: What takes options.
-        prefix: Of the problem's options.
-        linear_solver: Options of a linear solver of one's own, for symmetric matrices or any; none:
-            the one of the matrix will do.
+        equations: The equations.
+        defaults: Database of default options.
+        prefix: Prefix of the problem's options.
+        linear_solver: Return the options of a separate linear solver, by the symmetry of the
+            matrix; empty: the linear solver of the matrix is used.
     """
 
     equations: Equations
@@ -70,11 +68,11 @@ class SolverContext:
     linear_solver: Callable[[bool], dict[str, Any]]
 
     def newton(self, part: str, options: Mapping[str, Any]) -> Newton:
-        """Newton's method on a SNES of its own; `Newton.attach` before every solution. Collective.
+        """Create Newton's method on a new SNES; `attach` it before every solution. Collective.
 
         Args:
-            part: What follows the prefix of the problem's options in that of this SNES.
-            options: Those that differ from `Newton.main_options`.
+            part: Part of the prefix of this SNES after the problem's.
+            options: Options that differ from `Newton.main_options`.
         """
         snes, own = self.snes(part, {**Newton.main_options(), **options})
         return Newton(self.equations, snes, lambda: True, own_solver=own)
@@ -87,13 +85,13 @@ class SolverContext:
         consistent: bool = True,
         with_own: Mapping[str, Any] | None = None,
     ) -> tuple[PETSc.SNES, bool]:
-        """A SNES of its own, and whether its linear solver is, too. Collective.
+        """Create a SNES; return it, and whether it has a separate linear solver. Collective.
 
         Args:
-            part: What follows the prefix of the problem's options in that of this SNES.
-            options: Of it, that of a linear solver of its own apart.
-            consistent: Whether it is for the consistent tangent, not for H₀.
-            with_own: More of them where the linear solver is its own.
+            part: Part of the prefix of this SNES after the problem's.
+            options: Options of the SNES.
+            consistent: Whether the matrix is the consistent tangent, not H₀.
+            with_own: Additional options with a separate linear solver.
         """
         solver = self.linear_solver(self.equations.is_symmetric(consistent))
         prefix, defaults = self.prefix + part, self.defaults
@@ -102,76 +100,75 @@ class SolverContext:
         defaults.set({**options, **solver, **((with_own or {}) if solver else {})}, prefix)
         monitors = {name: defaults.get(self.prefix + name) for name in _MONITORS}
         defaults.set({k: v for k, v in monitors.items() if v is not None}, prefix)
-        defaults.let_read(snes)
+        defaults.set_from_options(snes)
         return snes, bool(solver)
 
 
 class StandaloneMethod(Method):
-    """A method with solvers of its own; a new one is such a class, and a line in `METHODS`.
+    """A method with its own nonlinear solvers, registered in `METHODS`.
 
-    `solve` starts from ``equations.solution`` and leaves there what it has found, with the data of
-    the contacts as they were; it has converged where ``equations.solved()`` after an
-    ``equations.residual``. Newton's method of `SolverContext.newton` does both: `Newton.attach` it
-    before
-    every solution, and return what its ``solve`` returns. It gives up after 14 iterations without
-    a lower residual (`ActiveSetMonitor.n_stalled`), so that the methods that follow get their turn.
+    `solve` starts from ``equations.solution`` and overwrites it, and restores the data of the
+    contacts; it has converged if ``equations.solved()`` after ``equations.residual``. Newton's
+    method of `SolverContext.newton` does both: call `Newton.attach` before every solution, and
+    return the result of its ``solve``. It fails after 14 iterations without a lower residual
+    (`ActiveSetMonitor.n_stalled`), so that another method can take over.
 
     Attributes:
-        is_newton_solution: Whether Newton's method found the last solution, so that the consistent tangent
-            is factored near it.
+        is_newton_solution: Whether Newton's method computed the last solution, near which the
+            consistent tangent is factored then.
     """
 
     is_newton_solution = False
 
     @abstractmethod
     def __init__(self, context: SolverContext) -> None:
-        """Set up what solves. Collective."""
+        """Create the solvers. Collective."""
 
     @property
     def suits(self) -> bool:
-        """Whether `check` would pass, and there are contacts that it is for."""
+        """Whether the method applies to the problem, without `check` failing."""
         return True
 
     def check(self) -> None:
-        """Look whether there is what it solves, where it was asked for.
+        """Check that the method, requested by the user, applies to the problem.
 
         Raises:
-            ValueError: It says why there is not.
+            ValueError: The method does not apply.
         """
         return
 
 
 class SnesMethod(Method):
-    """A method on a SNES: the main one, whose options are the user's, or one of another method.
+    """A method on a SNES: the main one, with the user's options, or one of another method.
 
     Args:
-        equations: What to solve.
-        own_solver: Whether SNES keeps its own linear solver, not that of the matrix.
+        equations: The equations.
+        own_solver: Whether SNES has its own linear solver, not that of the matrix.
 
     Attributes:
         snes: The solver.
-        gives_up: Whether to stop where the residual does not fall any more.
-        coarse: Residual, as a share of the forces, that ends it before the tolerance does.
+        can_hand_over: Return whether to stop when the residual stalls.
+        coarse_rtol: Residual by the forces that suffices, if larger than the tolerance.
     """
 
     def __init__(
         self,
         equations: Equations,
         snes: PETSc.SNES,
-        gives_up: Callable[[], bool],
+        can_hand_over: Callable[[], bool],
         *,
         own_solver: bool = False,
     ) -> None:
-        self.snes, self.gives_up, self.coarse_rtol = snes, gives_up, 0.0
+        self.snes, self.can_hand_over, self.coarse_rtol = snes, can_hand_over, 0.0
         self._own_solver = own_solver
-        self._function: PETSc.Vec | None = None  # of the system it is attached to
+        self._function: PETSc.Vec | None = None  # residual of the attached system
         self._equations = equations
         self._callbacks = Callbacks(equations.full.unknowns.comm)
         self.consistent = False
 
     @property
     def max_it(self) -> int:
-        """Iterations in all before it is given up."""
+        """Maximum number of iterations."""
         return int(self.snes.getTolerances()[3])
 
     @max_it.setter
@@ -179,10 +176,10 @@ class SnesMethod(Method):
         self.snes.setTolerances(max_it=limit)
 
     def attach(self, *, consistent: bool) -> None:
-        """Give SNES its callbacks and the linear solver for H₀ or the consistent tangent."""
+        """Set callbacks and the linear solver, for H₀ or the consistent tangent, in SNES."""
         self.consistent = consistent
-        # Weak, so that SNES does not keep what keeps SNES: the garbage collector would free such a
-        # cycle, at another time on every rank, and to free a factorisation is collective.
+        # Weak: the garbage collector would free a cycle at different times on the ranks, and to
+        # free a factorisation is collective.
         this: SnesMethod = weakref.proxy(self)
         equations = self._equations
         if self._function not in (None, equations.function):
@@ -206,14 +203,14 @@ class SnesMethod(Method):
         self._equations.assemble_tangent(x, J)
 
     def solve(self) -> tuple[int, int]:
-        """See `Method.solve`."""
+        """Solve the equations by the SNES. Collective."""
         return self._callbacks.solve(self.snes, self._equations.solution)
 
     def converged(self) -> int:
-        """Why SNES ends here, or that it goes on, as SNES has it."""
+        """Return the SNES reason of the convergence test, or that SNES iterates."""
         if self._equations.solved(self.coarse_rtol):
             return int(_REASONS.CONVERGED_FNORM_RELATIVE)
-        if self._equations.monitor.n_stalled > _PATIENCE and self.gives_up():
+        if self._equations.monitor.n_stalled > _MAX_STALLED_ITERATIONS and self.can_hand_over():
             return int(_REASONS.DIVERGED_LINE_SEARCH)
         return int(_REASONS.ITERATING)
 
@@ -222,30 +219,29 @@ class Newton(SnesMethod):
     """Newton's method with the consistent tangent.
 
     Attributes:
-        max_halvings: Of a step that `_level` refuses, before what is left of it is taken: where a
-            point is about to change its status no share of a step need lower anything. Infinite:
-            the line search fails.
+        max_halvings: Halvings of a step after which it is taken without a decrease of the level,
+            which need not exist at a change of status. Infinite: the line search fails.
     """
 
     def __init__(
         self,
         equations: Equations,
         snes: PETSc.SNES,
-        gives_up: Callable[[], bool],
+        can_hand_over: Callable[[], bool],
         *,
         own_solver: bool = False,
     ) -> None:
-        super().__init__(equations, snes, gives_up, own_solver=own_solver)
-        self._iterate: tuple[PETSc.Vec, PETSc.Vec] | None = None  # and the residual there
-        self._step: float | None = None  # norm of the correction there, once it is asked for
-        self._trial: Array | None = None  # whose tangent the matrix holds, if not the iterate's
+        super().__init__(equations, snes, can_hand_over, own_solver=own_solver)
+        self._iterate: tuple[PETSc.Vec, PETSc.Vec] | None = None  # with its residual
+        self._step_norm: float | None = None  # of its correction, on demand
+        self._trial_point: Array | None = None  # of the assembled tangent, if not the iterate
         self.max_halvings = np.inf
-        self._trials = 0  # of the present step
-        self._looks_ahead = False  # whether to ask for the correction after a whole step
+        self._n_trials = 0  # of the present step
+        self._use_end_tangent = False  # whether to try the tangent at the end of a full step
 
     @classmethod
     def main_options(cls) -> Mapping[str, Any]:
-        """See `Method.main_options`: steps are halved until `_level` falls."""
+        """Return options by which steps are halved until the level function decreases."""
         return {
             "snes_type": "newtonls",
             "snes_stol": 0.0,
@@ -258,9 +254,9 @@ class Newton(SnesMethod):
         }
 
     def attach(self, *, consistent: bool) -> None:
-        """See `SnesMethod.attach`; a line search gets its level function."""
+        """Set callbacks, level function and the linear solver in SNES."""
         super().attach(consistent=consistent)
-        self._iterate = self._trial = None
+        self._iterate = self._trial_point = None
         if self.snes.getType() != PETSc.SNES.Type.NEWTONLS:
             return
         this: Newton = weakref.proxy(self)
@@ -268,79 +264,77 @@ class Newton(SnesMethod):
             self.snes,
             lambda x, f: this._compute_residual(x, f),
             self._equations.function.duplicate(),
-            lambda x, f: this._level(x, f),
+            lambda x, f: this._compute_level(x, f),
         )
 
     def _compute_jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
-        trial, self._iterate, self._trial = self._trial, None, None
+        trial, self._iterate, self._trial_point = self._trial_point, None, None
         different = trial is None or not np.array_equal(x.array_r, trial)
         if self._equations.full.unknowns.comm.allreduce(int(different)):
             super()._compute_jacobian(x, J)
         else:
             self._equations.note()
 
-    def _level(self, x: PETSc.Vec, f: PETSc.Vec) -> float:
-        """min(|J⁻¹f| / |J⁻¹f₀|, |f| / |f₀|)² of a residual f at a trial x. Collective.
+    def _compute_level(self, x: PETSc.Vec, f: PETSc.Vec) -> float:
+        """Compute min(|J⁻¹f| / |J⁻¹f₀|, |f| / |f₀|)² of a residual f at a trial x. Collective.
 
-        J is the tangent and f₀ the residual of the iterate from which the line search starts, where
-        it asks first. The first ratio is the natural level function (P. Deuflhard, Newton Methods
-        for Nonlinear Problems, 2004, section 3.3): a step is taken if the simplified Newton
-        correction behind it is smaller than the step, by a tenth of the share of it that is tried.
-        Where a slender body turns a linear step stretches it by the square of the angle, which
-        takes forces orders of magnitude larger than to bend it, and where stiff contact closes a
-        little too deep forces are large, too; the next correction is small. Where points change
-        their status neither need fall along a step: it is taken if one does.
+        J is the tangent and f₀ the residual of the iterate, at which the line search evaluates
+        first. The first ratio is the natural level function (P. Deuflhard, Newton Methods for
+        Nonlinear Problems, 2004, section 3.3): a step is taken if the simplified Newton correction
+        is smaller than the step, by a tenth of the damping. It ignores the large residuals of small
+        errors: a slender body stretched by a linearised rotation, or stiff contact closed a little
+        too deep. At changes of status one of the ratios has to decrease.
 
-        Neither need fall where points close along a step, whose stiffness J does not have. On a
-        linear bulk little else changes J: a whole step is taken, too, if the correction that
-        follows, by the tangent at its end, is smaller. Where it is not, as between stick and slip,
-        that is not tried again in this solution: it costs two factorisations.
+        Neither need decrease if points close along the step, whose stiffness is not in J. With a
+        linear bulk a full step is also taken if the next correction, by the tangent at its end, is
+        smaller. If not, as between stick and slip, this is not tried again in this solution, for it
+        costs two factorisations.
         """
         if self._iterate is None:
-            self._iterate, self._step = (x.copy(), f.copy()), None
-            self._trials = 0
+            self._iterate, self._step_norm = (x.copy(), f.copy()), None
+            self._n_trials = 0
             return 1.0
-        self._trials += 1
-        if self._trials > self.max_halvings:
+        self._n_trials += 1
+        if self._n_trials > self.max_halvings:
             return 0.0
         iterate, residual = self._iterate
-        if residual.norm() == 0.0:  # what is left is round-off that no step takes away
+        if residual.norm() == 0.0:  # only excluded round-off is left
             return 1.0
-        fall = f.norm() / residual.norm()
-        if fall <= 1.0 - _DECREASE:
-            return float(fall * fall)
-        if self._step is None:
-            self._step = self._correction(residual)
-        # Nor is the first step that is tried the whole one where that is too long.
-        share = (x - iterate).norm() / self._step
-        enough = 1.0 - _DECREASE * min(1.0, float(share))
-        level = min(fall, self._correction(f) / self._step) / enough
-        if level > 1.0 and share > _WHOLE and self._looks_ahead:
+        ratio = f.norm() / residual.norm()
+        if ratio <= 1.0 - _MIN_LEVEL_DECREASE:
+            return float(ratio * ratio)
+        if self._step_norm is None:
+            self._step_norm = self._correction_norm(residual)
+        # The first trial is shorter than the full step if that exceeds the limit.
+        damping = (x - iterate).norm() / self._step_norm
+        required = 1.0 - _MIN_LEVEL_DECREASE * min(1.0, float(damping))
+        level = min(ratio, self._correction_norm(f) / self._step_norm) / required
+        if level > 1.0 and damping > _FULL_STEP_RATIO and self._use_end_tangent:
             tangent = self._equations.matrix(True)
             self._equations.assemble_tangent(x, tangent, trial=True)
-            if self._correction(f) <= enough * self._step:
-                self._trial = x.array_r.copy()
+            if self._correction_norm(f) <= required * self._step_norm:
+                self._trial_point = x.array_r.copy()
                 return 0.0
-            self._looks_ahead, self._trial = False, None
+            self._use_end_tangent, self._trial_point = False, None
             self._equations.assemble_tangent(iterate, tangent, trial=True)
         return float(level * level)  # infinite where it overflows
 
-    def _correction(self, f: PETSc.Vec) -> float:
-        """Norm of the Newton correction of a residual by the present tangent. Collective."""
+    def _correction_norm(self, f: PETSc.Vec) -> float:
+        """Compute the norm of J⁻¹f with the present tangent; infinite on failure. Collective."""
         ksp, correction = self.snes.getKSP(), f.duplicate()
         ksp.solve(f, correction)
-        found = ksp.getConvergedReason() > 0
+        solved = ksp.getConvergedReason() > 0
         linear.forget_failure(ksp.getPC())
-        size = correction.norm() if found else np.inf
+        size = correction.norm() if solved else np.inf
         correction.destroy()
         return float(size)
 
     def solve(self) -> tuple[int, int]:
-        """See `Method.solve`."""
-        self._iterate = self._trial = None
-        self._looks_ahead = self._equations.full.bulk.linear
+        """Solve the equations by Newton's method. Collective."""
+        self._iterate = self._trial_point = None
+        self._use_end_tangent = self._equations.full.bulk.linear
         iterations, reason = super().solve()
-        # The line search `cp`, by option, takes a step across the residual, F·y = 0, for the end.
+        # The line search `cp`, by option, takes F·y = 0 for convergence.
         if reason == _REASONS.CONVERGED_FNORM_ABS:
             reason = int(_REASONS.DIVERGED_LINE_SEARCH)
         return iterations, reason

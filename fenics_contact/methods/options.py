@@ -1,7 +1,7 @@
-"""PETSc options: the command line's, and those that hold where nobody says anything.
+"""PETSc options: those of the command line, and defaults.
 
-petsctools has the like; it takes the command line only where it initialises PETSc itself, which
-DOLFINx has done when a problem is made.
+petsctools offers the same, but reads the command line only if it initialises PETSc itself, which
+DOLFINx has done before.
 """
 
 from __future__ import annotations
@@ -23,33 +23,33 @@ __all__ = ["Defaults", "take_command_line"]
 
 logger = logging.getLogger("fenics_contact")
 
-# Read when something is factored, set up or done; in the first solve that may not be.
+# Options read in a factorisation, a set-up or at the end, perhaps not in the first solve.
 _READ_LATE = re.compile("view|converged_reason|mat_|mg_|gamg|interior_")
 
 
 def take_command_line(prefix: str, comm: MPI.Comm) -> None:
     """Put options of the command line into PETSc's database, with their values. Collective.
 
-    PETSc looks there itself only if it is initialised with ``sys.argv``, which no script need do.
-    What the database has already stays.
+    PETSc itself reads them only if it is initialised with ``sys.argv``. Existing options are not
+    overwritten.
 
     Args:
-        prefix: What their names begin with; without one there are none.
-        comm: The ranks; the first one's command line is taken.
+        prefix: Prefix of the option names; if empty, there are none.
+        comm: The communicator; the command line is that of its first rank.
     """
     database = PETSc.Options()
     arguments = comm.bcast(getattr(sys, "argv", [])[1:])
-    # Of equal names the last one counts, and is found first here.
+    # The last one of equal names counts.
     for argument, following in reversed(list(pairwise([*arguments, None]))):
         name = argument.removeprefix("-").removeprefix("-")
-        mine = prefix and _is_option(argument) and name.startswith(prefix) and name != prefix
-        if mine and not database.hasName(name):
+        is_own = prefix and _is_option(argument) and name.startswith(prefix) and name != prefix
+        if is_own and not database.hasName(name):
             has_value = following is not None and not _is_option(following)
             database.setValue(name, following if has_value else None)
 
 
 def _is_option(argument: str) -> bool:
-    """Whether it is the name of an option and no value, told apart as PETSc does."""
+    """Return whether an argument is the name of an option, not a value, as PETSc decides."""
     if not re.match("--?[A-Za-z]", argument):
         return False
     try:
@@ -60,45 +60,45 @@ def _is_option(argument: str) -> bool:
 
 
 class Defaults:
-    """Options that are in PETSc's database only while they are read.
+    """Default options, in PETSc's database only while solvers read them.
 
-    Solvers read their options when they are made, those inside them (the levels of multigrid) when
-    they are set up. Left there, the options would hold for other problems of the same prefix.
+    Solvers read options when they are created, inner ones (multigrid levels) when they are set up.
+    Left in the database, the options would apply to other problems with the same prefix.
     """
 
     def __init__(self) -> None:
         self._values: dict[str, Any] = {}
-        self._given: set[str] = set()  # by the caller
-        self._unread: set[str] = set()  # of those
-        self._told = False
+        self._caller_options: set[str] = set()  # by the caller
+        self._unused: set[str] = set()  # subset of them
+        self._has_warned = False
 
     def set(self, options: Mapping[str, Any], prefix: str) -> None:
-        """Add options, given without prefix, that nothing has set; those added before win."""
+        """Add options, given without prefix, unless they are already in here or the database."""
         database = PETSc.Options()
         for name, value in options.items():
             key = prefix + name
             if key not in self._values and not database.hasName(key):
                 self._values[key] = value
 
-    def give(self, options: Mapping[str, Any], prefix: str) -> None:
-        """`set` what the caller says, who is told if nothing reads it."""
+    def set_caller_options(self, options: Mapping[str, Any], prefix: str) -> None:
+        """Add options of the caller, with a warning if they remain unused."""
         self.set(options, prefix)
         names = {prefix + name for name in options}
-        self._given |= names
-        self._unread |= names
+        self._caller_options |= names
+        self._unused |= names
 
     def warn_of_unread(self, prefix: str) -> None:
-        """Name, once, the options that the caller or the database has and no solver has read."""
-        if self._told or not prefix:
+        """Warn once of options, of the caller or the database, that no solver has read."""
+        if self._has_warned or not prefix:
             return
-        self._told = True
-        unread = set(self._unread)
+        self._has_warned = True
+        unused = set(self._unused)
         for name in PETSc.Options().getAll():
             if name.startswith(prefix):
-                unread.discard(name)
+                unused.discard(name)
                 if not compat.option_was_read(name):
-                    unread.add(name)
-        names = [f"-{name}" for name in sorted(unread) if not _READ_LATE.search(name, len(prefix))]
+                    unused.add(name)
+        names = [f"-{name}" for name in sorted(unused) if not _READ_LATE.search(name, len(prefix))]
         if names:
             logger.warning(
                 "unused options: %s; check their spelling, or whether their solver is in use",
@@ -106,23 +106,23 @@ class Defaults:
             )
 
     def get(self, name: str) -> Any:
-        """The value that holds for a name with prefix; None if there is none."""
+        """Return the value of an option, by its name with prefix; None if it is not set."""
         database = PETSc.Options()
         return database.getString(name) if database.hasName(name) else self._values.get(name)
 
-    def let_read(self, solver: PETSc.SNES | PETSc.KSP) -> None:
-        """Let a solver take the options of its prefix. Collective.
+    def set_from_options(self, solver: PETSc.SNES | PETSc.KSP) -> None:
+        """Set a solver from the options with its prefix. Collective.
 
         Raises:
-            ValueError: PETSc refuses one of them; the text has all that were given.
+            ValueError: PETSc refuses an option; the text has all that were given.
         """
         self._read(solver, solver.setFromOptions)
 
     def set_up(self, snes: PETSc.SNES) -> None:
-        """Set up a solver that has read its options; some are looked at only then. Collective.
+        """Set up a solver, which reads further options. Collective.
 
         Raises:
-            ValueError: As in `let_read`.
+            ValueError: PETSc refuses an option.
         """
         self._read(snes, snes.setUp)
 
@@ -132,18 +132,20 @@ class Defaults:
                 read()
             except PETSc.Error as error:
                 prefix = solver.getOptionsPrefix() or ""
-                here = PETSc.Options().getAll().items()
-                mine = {k: v for k, v in here if k in self._given or k not in self._values}
-                told = [f"-{k} {v}" for k, v in sorted(mine.items()) if k.startswith(prefix)]
-                why = str(error).splitlines()[-1].split("] ", 1)[-1]
+                database = PETSc.Options().getAll().items()
+                relevant = {
+                    k: v for k, v in database if k in self._caller_options or k not in self._values
+                }
+                given = [f"-{k} {v}" for k, v in sorted(relevant.items()) if k.startswith(prefix)]
+                reason = str(error).splitlines()[-1].split("] ", 1)[-1]
                 raise ValueError(
-                    f"PETSc refuses an option with prefix {prefix!r}: {why}; the options given are "
-                    f"{', '.join(told) or 'none'}"
+                    f"PETSc refuses an option with prefix {prefix!r}: {reason}; the options given are "
+                    f"{', '.join(given) or 'none'}"
                 ) from error
 
     @contextmanager
     def present(self) -> Iterator[None]:
-        """Have the options in the database inside the block."""
+        """Have the options in PETSc's database inside the block."""
         database = PETSc.Options()
         added = {k: v for k, v in self._values.items() if not database.hasName(k)}
         for key, value in added.items():
@@ -152,6 +154,6 @@ class Defaults:
             yield
         finally:
             for key in added:
-                if key in self._unread and compat.option_was_read(key):
-                    self._unread.remove(key)
+                if key in self._unused and compat.option_was_read(key):
+                    self._unused.remove(key)
                 database.delValue(key)

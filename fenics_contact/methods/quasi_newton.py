@@ -33,9 +33,9 @@ class QuasiNewton(SnesMethod):
     """The method; SNES makes a round, whose limit of iterations is its own."""
 
     def __init__(
-        self, equations: Equations, snes: PETSc.SNES, gives_up: Callable[[], bool]
+        self, equations: Equations, snes: PETSc.SNES, can_hand_over: Callable[[], bool]
     ) -> None:
-        super().__init__(equations, snes, gives_up)
+        super().__init__(equations, snes, can_hand_over)
         self._limit: int | None = None
         self._refreshed = False
 
@@ -100,7 +100,7 @@ class QuasiNewton(SnesMethod):
                 return iterations, failure
             if not self._refresh():
                 return iterations, compat.NOT_FINITE
-            may_hand_over = stalls >= _FEW_STALLS and self.gives_up()
+            may_hand_over = stalls >= _FEW_STALLS and self.can_hand_over()
             if may_hand_over and equations.find_overload() is not None:
                 return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
 

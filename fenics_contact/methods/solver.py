@@ -192,7 +192,7 @@ class Solver:
         settings, prefix, equations = self._settings, self._settings.prefix, self.equations
         options = self.options = Defaults()
         options.set(_VECTORS, "")
-        options.give(settings.petsc_options, prefix)
+        options.set_caller_options(settings.petsc_options, prefix)
         if settings.accuracy is not None:
             # Residuals as large as what multipliers may miss would make rounds that change nothing.
             augmented = [c for c in self._full.contacts if c.multipliers is not None]
@@ -237,14 +237,14 @@ class Solver:
             options.set(
                 self.system.linear_solver(symmetric=symmetric, accurate=not quasi_newton), part
             )
-            options.let_read(ksp)
+            options.set_from_options(ksp)
             equations.solvers[consistent] = ksp
         this: Solver = weakref.proxy(self)  # SNES would keep what keeps it
         main = QuasiNewton if quasi_newton else Newton
         self.main = main(equations, snes, lambda: this.can_fall_back())
         self._forget_matrices()
         self.main.attach(consistent=not quasi_newton)
-        options.let_read(snes)
+        options.set_from_options(snes)
         options.set_up(snes)
 
         def newton_solver(symmetric: bool) -> dict[str, Any]:
