@@ -1,11 +1,10 @@
-"""Between which points of two bodies an increment is solved: those opposite each other at its end.
+"""Fixed-point iteration for the pairs of an increment with small-displacement kinematics.
 
-With small displacements pairs of points are found in one state of the bodies and stay as they are
-while the increment is solved. Where it ends points may have slid off their pairs; then it is solved
-again between others. This is an iteration for the state in which pairs are found. It begins with a
-predictor, the state in which the increment ends if it goes on as the last one, and is relaxed by
-Aitken's method [U. Küttler, W. A. Wall, Comput. Mech. 43 (2008) 61-72, eq. 44], contact by contact:
-a body that is pushed along a curved surface answers to other pairs by more than their change.
+Pairs are found in one state and fixed while the increment is solved. If points have slid off their
+pairs at the end, new pairs are found and the increment is solved again. The first state is
+extrapolated from the last increment; the others are relaxed by Aitken's method [U. Küttler, W. A.
+Wall, Comput. Mech. 43 (2008) 61-72, eq. 44] for each contact, as new pairs on a curved surface may
+displace a body by more than the pairs have changed.
 """
 
 from __future__ import annotations
@@ -26,50 +25,45 @@ from fenics_contact.types import Array
 
 __all__ = ["OppositePoints"]
 
-# Number of times that pairs of a contact are found in an increment: with relaxation 2 to 4 do.
-_MAX_PAIRINGS = 10
-# Least and largest share of the way to where the increment ended, by relaxation.
-_LEAST_SHARE, _LARGEST_SHARE = 0.1, 2.0
-# Largest extrapolation of the last increment, doubled ones included: beyond, contact hardly goes on
-# as it did.
-_MAX_RATIO = 2.1
+_MAX_PAIRINGS = 10  # of a contact in an increment; 2 to 4 usually suffice
+_MIN_RELAXATION, _MAX_RELAXATION = 0.1, 2.0
+# Largest extrapolation of the last increment, so that increments may double.
+_MAX_INCREMENT_RATIO = 2.1
 
 
 @dataclass(frozen=True)
 class _Pairing:
-    """How pairs of a contact were found last.
+    """The last pairing of a contact.
 
     Attributes:
-        state: The state in which they were found.
-        slide: How far points had slid from the pairs before in the solution between them, in sizes
-            of their facets, (n_points, gdim), NaN where they did not transmit forces; None: there
-            is no solution yet.
-        depth: Of the points in the opposing body there, or by the predictor, (n_points,) (length).
-        share: Of the way from the state before to the end of the increment.
-        number: How often they have been found in this increment after a solution.
-        opposite: The pairs, and the committed jump between them.
+        state: The state in which the pairs are found.
+        slide: Slide from the previous pairs in their solution, by facet size, (n_points, gdim), NaN
+            at points without force; None: no solution yet.
+        depth: Depth of the points in the opposing body, solved or predicted, (n_points,) (length).
+        relaxation: Relaxation factor from the previous state to the end of the increment.
+        number: Number of pairings after a solution in this increment.
+        kinematics: The pairs and their committed jump.
     """
 
     state: Array
     slide: Array | None
     depth: Array
-    share: float
+    relaxation: float
     number: int
     kinematics: KinematicsState | None = None
 
 
 class OppositePoints:
-    """The iteration for the pairs of an increment.
+    """Fixed-point iteration for the pairs of an increment.
 
     Args:
         full: The system on all unknowns.
-        contacts: Of the problem, all or none.
+        contacts: All contacts of the problem, or none.
 
     Attributes:
-        contacts: Those of them whose pairs may be found anew.
-        predicted: Whether the first pairs are predicted ones.
-        end: The state in which the increment ended between the pairs before; None: it is not solved
-            yet.
+        contacts: The contacts whose pairs can be updated.
+        predicted: Whether the present pairs are predicted.
+        end: The state at the end of the increment with the previous pairs; None: not solved yet.
     """
 
     def __init__(self, full: FullSystem, contacts: Sequence[Contact]) -> None:
@@ -81,17 +75,17 @@ class OppositePoints:
 
     @property
     def replaced(self) -> bool:
-        """Whether others are in the place of the committed pairs."""
+        """Whether the committed pairs are replaced by others."""
         return bool(self._pairings)
 
     def predict(self, state: State, prescribed: Array, load: Array) -> None:
-        """Find the pairs of where the increment ends if it goes on as the last one. Collective.
+        """Find the pairs at the end of an increment extrapolated from the last one. Collective.
 
-        Of those contacts whose pairs are found anew at every commit, and need new ones by then for
-        the points that transmit forces in the committed state.
+        They are predicted for contacts with updates at every commit whose points with committed
+        forces need new pairs.
 
         Args:
-            state: The committed state, complete.
+            state: The complete committed state.
             prescribed: The unknowns with the present values of the Dirichlet conditions (length).
             load: The present external forces (force).
         """
@@ -115,106 +109,107 @@ class OppositePoints:
     def _increment_ratio(
         self, state: State, change: Array, prescribed: Array, load: Array
     ) -> Array:
-        """Loads and prescribed values of this increment relative to the last one's. Collective.
+        """Compare loads and prescribed values of this increment with the last one. Collective.
 
-        By projection, of every group of interacting bodies. Prescribed displacements count by the
-        stiffness of the bulk.
+        The ratio is a projection for every group of coupled bodies, with prescribed displacements
+        weighted by the stiffness of the bulk.
 
         Returns:
-            At the unknowns: 1 in equal increments; 0 where the last one had none, or loads turn
-            round or grow by much more.
+            At the unknowns: 1 for equal increments; 0 if the last one was zero, or loads are
+            reversed or grow much more.
         """
         full, n = self._full, self._full.unknowns.n_dofs
-        held, stiffness = full.constrained[:n], full.bulk.scale
+        prescribed_dofs, stiffness = full.constrained[:n], full.bulk.scale
         groups = full.scales.group[full.label]
 
         def forces(displacement: Array, force: Array) -> Array:
-            return np.where(held, stiffness * displacement[:n], force[:n])
+            return np.where(prescribed_dofs, stiffness * displacement[:n], force[:n])
 
-        whole = forces(state.unknowns, state.load)
+        total = forces(state.unknowns, state.load)
         last = forces(change, state.load_change)
-        now = forces(prescribed - state.unknowns, load - state.load)
-        products = (last * now, last * last, whole * whole)
+        present = forces(prescribed - state.unknowns, load - state.load)
+        products = (last * present, last * last, total * total)
         sums = [np.bincount(groups[:n], row, minlength=full.scales.n_groups) for row in products]
-        along, size, largest = full.scales.global_sum(np.array(sums))
+        product, size, largest = full.scales.global_sum(np.array(sums))
         known = size > NEGLIGIBLE**2 * largest
-        ratio = along / np.where(known, size, 1.0)
-        ratio[~(known & (ratio > 0.0) & (ratio < _MAX_RATIO))] = 0.0
+        ratio = product / np.where(known, size, 1.0)
+        ratio[~(known & (ratio > 0.0) & (ratio < _MAX_INCREMENT_RATIO))] = 0.0
         return np.asarray(ratio[groups])
 
     def drop_prediction(self) -> bool:
-        """Go back to the committed pairs if others were predicted; whether so."""
+        """Restore the committed pairs if others were predicted; return whether so."""
         predicted, self.predicted = self.predicted, False
         if predicted:
             self._pairings, self.end = {}, None
         return predicted
 
     def to_update(self) -> list[Contact]:
-        """Contacts that need new pairs, see `ContactKinematics.needs_new_pairs`. Collective."""
+        """Return contacts that need new pairs (`ContactKinematics.needs_new_pairs`). Collective."""
         return [
             c
             for c in self.contacts
-            if self._number_of(c) < _MAX_PAIRINGS and c.contact_kinematics.needs_new_pairs(c.values)
+            if self._count_pairings(c) < _MAX_PAIRINGS
+            and c.contact_kinematics.needs_new_pairs(c.values)
         ]
 
     def to_update_for(self, names: Sequence[str]) -> list[Contact]:
-        """Contacts whose pairs may cause a large small-displacement error. Collective.
+        """Return contacts whose pairs may cause a large small-displacement error. Collective.
 
-        All of which points have slid; and those with the error if their pairs are not of this
-        increment, for points without a pair do not tell how far they have come.
+        Their points have slid; or they have the error and pairs of an earlier increment, in which
+        the slide of unpaired points is unknown.
 
         Args:
-            names: Of contacts with a large error.
+            names: Names of the contacts with a large error.
         """
         if not any(c.name in names for c in self.contacts):
             return []
         return [
             c
             for c in self.contacts
-            if (number := self._number_of(c)) < _MAX_PAIRINGS
+            if (number := self._count_pairings(c)) < _MAX_PAIRINGS
             and (
                 c.contact_kinematics.largest_slide(c.values) > NEGLIGIBLE_SLIDE
                 or (c.name in names and number == 0)
             )
         ]
 
-    def _number_of(self, contact: Contact) -> int:
-        """How often its pairs have been found in this increment after a solution."""
+    def _count_pairings(self, contact: Contact) -> int:
+        """Return the number of pairings of a contact after a solution in this increment."""
         pairing = self._pairings.get(contact.name)
         return 0 if pairing is None else pairing.number
 
     def choose_states(self, contacts: Sequence[Contact], end: Array) -> None:
-        """Choose the states in which to find the pairs of evaluated contacts next. Collective.
+        """Set the states in which the next pairs of evaluated contacts are found. Collective.
 
         Args:
             contacts: The contacts.
-            end: The state in which the increment has ended between the present pairs.
+            end: The state at the end of the increment with the present pairs.
         """
         self.end = end
         for contact in contacts:
             values, last = contact.values, self._pairings.get(contact.name)
             slide = values.slide / contact.quadrature.facet_sizes[:, None]
             slide[~contact.contact_kinematics.transmitting_points(values)] = np.nan
-            share, state, number = 1.0, end, 1
+            relaxation, state, number = 1.0, end, 1
             if last is not None:
                 number = last.number + 1
             if last is not None and last.slide is not None:
                 change = slide - last.slide
                 sums = [np.nansum(last.slide * change), np.nansum(change * change)]
-                along, size = global_sum(contact.surface.mesh.comm, sums)
+                product, size = global_sum(contact.surface.mesh.comm, sums)
                 if size > 0:
-                    relaxed = -last.share * float(along / size)
-                    share = min(max(relaxed, _LEAST_SHARE), _LARGEST_SHARE)
-                state = last.state + share * (end - last.state)
-            self._pairings[contact.name] = _Pairing(state, slide, values.depth, share, number)
+                    aitken = -last.relaxation * float(product / size)
+                    relaxation = min(max(aitken, _MIN_RELAXATION), _MAX_RELAXATION)
+                state = last.state + relaxation * (end - last.state)
+            self._pairings[contact.name] = _Pairing(state, slide, values.depth, relaxation, number)
 
     def find(self, committed: Array) -> None:
-        """Find the pairs whose states were chosen. Collective.
+        """Find the pairs in the states that were set. Collective.
 
         Args:
-            committed: The committed state, complete.
+            committed: The complete committed state.
         """
-        new = [c for c in self.contacts if self._is_chosen(c)]
+        new = [c for c in self.contacts if self._is_pending(c)]
         for contact in new:
             pairing = self._pairings[contact.name]
             self._full.set_state(pairing.state)
@@ -222,18 +217,18 @@ class OppositePoints:
         self._full.set_state(committed)
         for contact in new:
             contact.contact_kinematics.update_committed_jump()
-            found = replace(
+            pairing = replace(
                 self._pairings[contact.name], kinematics=contact.contact_kinematics.state()
             )
-            self._pairings[contact.name] = found
+            self._pairings[contact.name] = pairing
 
-    def _is_chosen(self, contact: Contact) -> bool:
-        """Whether a state was chosen in which pairs are not found yet."""
+    def _is_pending(self, contact: Contact) -> bool:
+        """Return whether the pairs of the last state are still to be found."""
         pairing = self._pairings.get(contact.name)
         return pairing is not None and pairing.kinematics is None
 
     def begin(self, contacts: Sequence[Contact]) -> None:
-        """Let an increment begin again, between the pairs found for it. Collective.
+        """Restart the increment with the pairs found for it. Collective.
 
         Args:
             contacts: All contacts of the problem.

@@ -68,8 +68,8 @@ class Defaults:
 
     def __init__(self) -> None:
         self._values: dict[str, Any] = {}
-        self._caller_options: set[str] = set()  # by the caller
-        self._unused: set[str] = set()  # subset of them
+        self._caller_keys: set[str] = set()
+        self._unused: set[str] = set()  # subset of `_caller_keys`
         self._has_warned = False
 
     def set(self, options: Mapping[str, Any], prefix: str) -> None:
@@ -84,7 +84,7 @@ class Defaults:
         """Add options of the caller, with a warning if they remain unused."""
         self.set(options, prefix)
         names = {prefix + name for name in options}
-        self._caller_options |= names
+        self._caller_keys |= names
         self._unused |= names
 
     def warn_of_unread(self, prefix: str) -> None:
@@ -132,14 +132,12 @@ class Defaults:
                 read()
             except PETSc.Error as error:
                 prefix = solver.getOptionsPrefix() or ""
-                database = PETSc.Options().getAll().items()
-                relevant = {
-                    k: v for k, v in database if k in self._caller_options or k not in self._values
-                }
-                given = [f"-{k} {v}" for k, v in sorted(relevant.items()) if k.startswith(prefix)]
-                reason = str(error).splitlines()[-1].split("] ", 1)[-1]
+                items = PETSc.Options().getAll().items()
+                shown = {k: v for k, v in items if k in self._caller_keys or k not in self._values}
+                given = [f"-{k} {v}" for k, v in sorted(shown.items()) if k.startswith(prefix)]
+                why = str(error).splitlines()[-1].split("] ", 1)[-1]
                 raise ValueError(
-                    f"PETSc refuses an option with prefix {prefix!r}: {reason}; the options given are "
+                    f"PETSc refuses an option with prefix {prefix!r}: {why}; the options given are "
                     f"{', '.join(given) or 'none'}"
                 ) from error
 
