@@ -1,4 +1,4 @@
-"""Predictor of an increment: of several states, the one with the least residual."""
+"""Predictor of an increment: the initial guess with the least residual of several candidates."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from fenics_contact.types import Array
 
 __all__ = ["Predictor"]
 
-# A start with up to this many times the residual of the best is taken if its points slip.
-_FAR = 100.0
+# Residual by the least one up to which the candidate with slipping points is preferred.
+_MAX_STEP_RATIO = 100.0
 
 
 @dataclass(frozen=True)
 class _ConvergedContact:
-    """What a contact bore in a solution.
+    """State of a contact in a solution.
 
     Attributes:
-        values: At the points.
-        tangent: Of the tractions there.
-        displacement: Of the points, (n_points, gdim) (length).
+        values: Values at the points.
+        tangent: Tangent of the tractions.
+        displacement: Displacement of the points, (n_points, gdim) (length).
     """
 
     values: PointValues
@@ -38,15 +38,15 @@ class _ConvergedContact:
 
 
 class Predictor:
-    """States to start from, by what is known of the last increment.
+    """Initial guesses based on the last increment.
 
     Attributes:
-        factored: Whether the consistent tangent factored last is that of a solution.
-        predict: Whether a step on it may be chosen.
-        change: By what the last committed increment changed the state of the full system; None:
-            it is not known.
-        expected: The state in which the increment ends if nothing touches that was apart, or in
-            which it ended between other pairs; None: it is not known.
+        factored: Whether the last factored consistent tangent is that of a solution.
+        predict: Whether a step with this tangent may be chosen.
+        change: Change of the state of the full system in the last committed increment; None:
+            unknown.
+        expected: The state at the end of the increment without new contact, or with the previous
+            pairs; None: unknown.
     """
 
     def __init__(self, equations: Equations) -> None:
@@ -54,40 +54,37 @@ class Predictor:
         self.expected: Array | None = None
         self.change: Array | None = None
         self._equations = equations
-        self._moved: Array | None = None  # of the values prescribed, since the last increment
-        self._converged: list[_ConvergedContact] = []  # by contact, in the solution found last
+        self._prescribed_change: Array | None = None  # change of the prescribed values
+        self._converged: list[_ConvergedContact] = []  # of the last solution
 
     def moved_from(self, before: Array) -> None:
-        """Take note of what the values prescribed now changed. Collective.
+        """Store the change of the prescribed values, for a nonlinear bulk. Collective.
 
         Args:
-            before: The state of the full system in which the last increment ended.
+            before: The state of the full system at the end of the last increment.
         """
         full = self._equations.full
-        self._moved = None
+        self._prescribed_change = None
         if not full.bulk.linear:
-            change = full.vector()
-            change.array[:] = full.state() - before
-            self._moved = change.array.copy() if change.norm() > 0 else None
+            vector = full.vector()
+            vector.array[:] = full.state() - before
+            self._prescribed_change = vector.array.copy() if vector.norm() > 0 else None
 
-    def forget(self) -> None:
-        """Another tangent is factored than that of the solution found last."""
+    def invalidate_tangent(self) -> None:
+        """Note that the factored tangent is not that of the last solution."""
         self.factored = self.predict = False
 
-    def keep(self, *, predict: bool) -> None:
-        """Take note of what contacts bear in the solution that was just found. Collective.
-
-        Its tangent is factored. Obstacles that move by the next increment take those points along
-        that stick, and no others.
+    def store_solution(self, *, predict: bool) -> None:
+        """Store the contacts of a solution whose tangent is factored. Collective.
 
         Args:
-            predict: See the attribute.
+            predict: Whether a step with the tangent may be chosen.
         """
         self.factored, self.predict = True, predict
         self.store_converged_contacts()
 
     def store_converged_contacts(self) -> None:
-        """Take note of what contacts bear, in the solution or where it has moved. Collective."""
+        """Store values, tangents and displacements of contacts with rigid obstacles. Collective."""
         self._converged = []
         contacts = self._equations.contacts
         if not any(contact.rigid for contact in contacts):
@@ -99,35 +96,33 @@ class Predictor:
                 _ConvergedContact(contact.values, contact.effective_law.tangent(), displacement)
             )
 
-    def choose(self, *, first_round: bool, cold: bool) -> Array:
-        """Choose the unknowns of the system to start from: what is nearest to equilibrium of these.
+    def choose_initial_guess(self, *, first_augmentation: bool, cold: bool) -> Array:
+        """Choose the initial guess of the unknowns nearest to equilibrium. Collective.
 
-        Collective. The present state; that state with one step of Newton's method on the tangent of
-        the last solution (`_stepped`, with a nonlinear bulk and other prescribed values
-        `_followed`), or where there is none continued as in the last increment (`_continued`); and
-        where it is expected to end.
+        Candidates are the present state, a Newton step from it with the tangent of the last
+        solution (`_step_by_tangent`; with a nonlinear bulk and changed prescribed values
+        `_step_by_prescribed_change`) or without one an extrapolation of the last increment
+        (`_extrapolate`), and the expected end.
 
-        At the present state itself no point has slipped yet, and all closed ones stick: from there
-        Newton's method takes ten steps to let them slip again, one after another from the edge of
-        the contact inwards; and a body that others slide over is dragged along by all of the way,
-        in a state that is near equilibrium and far from the solution. The start by a step on the
-        tangent of the last solution has the right ones slipping, and is chosen unless it is far
-        off, or goes where friction pulls: then the load has turned round, and they stick.
+        At the present state all closed points stick: Newton's method takes about ten iterations
+        until they slip again, from the edge of the contact inwards, and a body under a sliding one
+        is dragged along, near equilibrium but far from the solution. The step with the last tangent
+        has the correct slipping points: it is preferred unless its residual is much larger or
+        friction does positive work, after a reversal of the load.
 
         Args:
-            first_round: Whether loads and obstacles, and not multipliers, are what changed.
-            cold: Whether nothing was borne before.
+            first_augmentation: Whether loads and obstacles have changed, not only multipliers.
+            cold: Whether there was no contact force before.
         """
         equations, system = self._equations, self._equations.system
         present: Array = system.state()
-        # What a step from here takes away leaves the round-off of what was there.
+        # The residual retains the round-off of the terms at the first initial guess.
         terms: Array = system.by_body(system.terms(present))[0]
         terms = np.asarray(np.hypot(terms, system.outside[1]), dtype=np.float64)
-        # The last matrix may be that of a step that overflowed. Later rounds of multipliers have
-        # the round-off of the first one's start, too.
+        # The last matrix may be that of an overflowing step.
         terms = np.where(np.isfinite(terms), terms, 0.0)
-        begun = equations.start
-        equations.start = replace(begun, terms=np.maximum(begun.terms, terms))
+        initial_forces = equations.start
+        equations.start = replace(initial_forces, terms=np.maximum(initial_forces.terms, terms))
         candidates: list[Array] = []
         residuals: list[float] = []
 
@@ -139,55 +134,59 @@ class Predictor:
 
         add(present)
         forces = equations.function.array_r.copy()
-        # Where nothing was borne yet the last increment tells nothing of this one.
+        # Without contact force the last increment is no guide.
         predicts, factored = self.predict and not cold, self.factored and not cold
-        self.forget()
-        step = None  # which of the candidates is one on the tangent of the last solution
-        turned = False
-        if self._moved is not None:
+        self.invalidate_tangent()
+        step = None  # index of the candidate by the tangent of the last solution
+        is_reversed = False
+        if self._prescribed_change is not None:
             if predicts:
-                step = add(self._followed(present))
-                turned = self._friction_works()
-            if step is None or turned or not residuals[step] < residuals[0]:
+                step = add(self._step_by_prescribed_change(present))
+                is_reversed = self._has_friction_work()
+            if step is None or is_reversed or not residuals[step] < residuals[0]:
                 step = None
-                add(self._followed(present, anew=True))
+                add(self._step_by_prescribed_change(present, anew=True))
         else:
-            tractions = self._tractions() if factored and first_round else None
+            tractions = self._predict_tractions() if factored and first_augmentation else None
             if tractions is not None or (predicts and equations.full.bulk.linear):
-                stepped = self._stepped(present, tractions)
+                stepped = self._step_by_tangent(present, tractions)
                 if stepped is not None:
                     step = add(stepped)
-                    turned = self._friction_works()
-        self._moved = None
-        if first_round and not predicts and not cold and self.change is not None:
-            add(self._continued(present, forces, self.change))
-        if self.expected is not None and first_round:
+                    is_reversed = self._has_friction_work()
+        self._prescribed_change = None
+        if first_augmentation and not predicts and not cold and self.change is not None:
+            add(self._extrapolate(present, forces, self.change))
+        if self.expected is not None and first_augmentation:
             add(system.part(self.expected))
-        if step is not None and not turned and residuals[step] <= _FAR * min(residuals):
+        if (
+            step is not None
+            and not is_reversed
+            and residuals[step] <= _MAX_STEP_RATIO * min(residuals)
+        ):
             return candidates[step]
         return candidates[int(np.argmin(residuals))]
 
-    def _continued(self, present: Array, forces: Array, change: Array) -> Array:
-        """Where a change like that of the last increment leaves no force along it. Collective.
+    def _extrapolate(self, present: Array, forces: Array, change: Array) -> Array:
+        """Extrapolate the last increment to zero residual along its direction. Collective.
 
-        By the secant between none and all of it, so that the sizes of the increments do not matter.
+        The secant over the whole increment makes the result independent of its size.
 
         Args:
-            present: The state.
-            forces: The residual there.
-            change: Of the state of the full system, in that increment.
+            present: The present state.
+            forces: The residual at the present state.
+            change: Change of the state of the full system in the last increment.
         """
         equations, system = self._equations, self._equations.system
-        way = system.part(change).copy()
-        way[system.constrained] = 0.0
-        equations.residual_at(present + way)
-        along = np.array([forces @ way, equations.function.array_r @ way])
-        first, last = equations.full.unknowns.comm.allreduce(along)
-        stiff = abs(first - last) > FLAT * abs(first)  # else the way feels no stiffness
-        return present + first / (first - last) * way if stiff and np.isfinite(last) else present
+        path = system.part(change).copy()
+        path[system.constrained] = 0.0
+        equations.residual_at(present + path)
+        work = np.array([forces @ path, equations.function.array_r @ path])
+        first, last = equations.full.unknowns.comm.allreduce(work)
+        stiff = abs(first - last) > FLAT * abs(first)
+        return present + first / (first - last) * path if stiff and np.isfinite(last) else present
 
-    def _friction_works(self) -> bool:
-        """Whether committed friction does work on the way to the start added last. Collective."""
+    def _has_friction_work(self) -> bool:
+        """Return whether committed friction does positive work up to the last guess. Collective."""
         work = 0.0
         for contact in self._equations.contacts:
             contact.evaluate()
@@ -196,25 +195,25 @@ class Predictor:
             work += float(contact.measure @ power)
         return bool(self._equations.full.unknowns.comm.allreduce(work) > 0.0)
 
-    def _followed(self, present: Array, *, anew: bool = False) -> Array:
-        """Where the body goes with the values prescribed now, by one step from before. Collective.
+    def _step_by_prescribed_change(self, present: Array, *, anew: bool = False) -> Array:
+        """Predict the effect of changed prescribed values by one linear step. Collective.
 
-        Next to conditions that moved far a nonlinear bulk may be turned inside out, and no
-        iteration comes back from there.
+        Otherwise they might invert cells of a nonlinear bulk next to the boundary, from which no
+        iteration recovers.
 
         Args:
-            present: The state with the values prescribed now.
-            anew: Whether to step on the tangent where the last increment ended, at which all closed
-                points stick; or else on that factored last, in which those slip that did.
+            present: The state with the present prescribed values.
+            anew: Whether to assemble the tangent at the end of the last increment, with all closed
+                points sticking; by default the last factored one is used, with slipping points.
 
         Returns:
-            The state; the present one where no step is found.
+            The predicted state, or ``present`` if the step failed.
         """
         equations, full = self._equations, self._equations.full
         change, image, step = full.vector(), full.vector(), full.vector()
-        assert self._moved is not None
-        change.array[:] = self._moved
-        full.set_state(present - self._moved)
+        assert self._prescribed_change is not None
+        change.array[:] = self._prescribed_change
+        full.set_state(present - self._prescribed_change)
         full.update_stiffness()
         ksp = equations.solvers[True]
         if anew:
@@ -223,36 +222,34 @@ class Predictor:
             equations.assemble(matrix, equations.regularised_tangents())
         assert full.stiffness is not None
         full.stiffness.mult(change, image)
-        tractions = None if anew else self._tractions()
-        if tractions is not None:  # obstacles have moved, too
-            for operator, borne, traction in zip(
+        tractions = None if anew else self._predict_tractions()
+        if tractions is not None:
+            for operator, converged, traction in zip(
                 full.operators, self._converged, tractions, strict=True
             ):
-                operator.add_force(image, traction - borne.values.total_traction)
+                operator.add_force(image, traction - converged.values.total_traction)
         image.array[full.constrained] = 0.0
         image.scale(-1.0 / full.bulk.scale)
         ksp.solve(image, step)
-        found = ksp.getConvergedReason() > 0
+        solved = ksp.getConvergedReason() > 0
         linear.forget_failure(ksp.getPC())
         full.set_state(present)
         full.update_stiffness()
-        if not found:
+        if not solved:
             return present
-        way: Array = step.array.copy()
-        return present + (way if anew else self._without_regularised_modes(full, present, way))
+        increment: Array = step.array.copy()
+        return present + (increment if anew else self._replace_modes(full, present, increment))
 
-    def _stepped(self, present: Array, tractions: list[Array] | None) -> Array | None:
-        """One Newton step on the tangent factored last. Collective.
+    def _step_by_tangent(self, present: Array, tractions: list[Array] | None) -> Array | None:
+        """Compute one Newton step with the last factored tangent. Collective.
 
         Args:
-            present: The state, at which the residual was computed last.
-            tractions: What points would bear if those that stuck still did, and all others bore
-                what they bore, see `_tractions`: in the residual an obstacle that has moved is deep
-                in points that were open, and nothing sticks to it any more; None: the residual is
-                what the step is to take away.
+            present: The state of the last residual.
+            tractions: Tractions of `_predict_tractions` in place of those of the residual, in which
+                a moved obstacle penetrates open points and does not stick; None: the residual.
 
         Returns:
-            The state; None where no step is found.
+            The state; None if the step failed.
         """
         equations, system = self._equations, self._equations.system
         forces, step = system.vector(), system.vector()
@@ -269,79 +266,75 @@ class Predictor:
         ksp = equations.solvers[True]
         ksp.solve(forces, step)
         dense.raise_stored_error(ksp)
-        found = ksp.getConvergedReason() > 0
+        solved = ksp.getConvergedReason() > 0
         linear.forget_failure(ksp.getPC())
-        way: Array = -step.array_r
+        increment: Array = -step.array_r
         for vector in (forces, step):
             vector.destroy()
-        return present + self._without_regularised_modes(system, present, way) if found else None
+        return present + self._replace_modes(system, present, increment) if solved else None
 
-    def _tractions(self) -> list[Array] | None:
-        """Those of the last solution, as moved obstacles would change them to first order.
-
-        Collective.
+    def _predict_tractions(self) -> list[Array] | None:
+        """Linearise the last tractions with respect to the motion of the obstacles. Collective.
 
         Returns:
-            (n_points, gdim) (stress) for every contact; None: no obstacle has moved, or Γc is not
-            where they were found.
+            (n_points, gdim) (stress) for every contact; None: no obstacle has moved, or Γc has.
         """
         equations, tractions, moved = self._equations, [], False
         comm, scales = equations.full.unknowns.comm, equations.full.scales
         if not self._converged:
             return None
-        for number, (contact, borne) in enumerate(
+        for number, (contact, converged) in enumerate(
             zip(equations.contacts, self._converged, strict=True)
         ):
-            opposite, traction = contact.contact_kinematics, borne.values.total_traction
-            change = np.linalg.norm(opposite.present_jump() - borne.displacement, axis=1)
+            kinematics, traction = contact.contact_kinematics, converged.values.total_traction
+            change = np.linalg.norm(kinematics.present_jump() - converged.displacement, axis=1)
             if global_max(comm, change / scales.size_at_points(number)) > NEGLIGIBLE:
                 return None
             if contact.rigid:
-                # An obstacle that has moved takes points that stuck along, and turns tractions.
-                now = contact.states.evaluate_present()
-                way = opposite.turned(borne.values.jump - now.jump)
-                length = np.linalg.norm(way, axis=1) / scales.size_at_points(number)
+                # A moved obstacle displaces sticking points, and rotates tractions.
+                values = contact.states.evaluate_present()
+                offset = kinematics.turned(converged.values.jump - values.jump)
+                length = np.linalg.norm(offset, axis=1) / scales.size_at_points(number)
                 moved = moved or global_max(comm, length) > NEGLIGIBLE
-                turn_back = opposite.angle(borne.values) - opposite.angle(now)
-                traction = opposite.in_frame(traction, turn_back)
-                traction = traction - np.einsum("qij,qj->qi", borne.tangent.by_jump, way)
+                rotation = kinematics.angle(converged.values) - kinematics.angle(values)
+                traction = kinematics.in_frame(traction, rotation)
+                traction = traction - np.einsum("qij,qj->qi", converged.tangent.by_jump, offset)
             tractions.append(traction)
         return tractions if moved else None
 
-    def _without_regularised_modes(self, system: System, present: Array, way: Array) -> Array:
-        """Replace in a step the modes along which its tangent was regularised. Collective.
+    def _replace_modes(self, system: System, present: Array, step: Array) -> Array:
+        """Replace the components of a step along regularised modes. Collective.
 
-        At a solution next to nothing is left of what regularises the tangent along such a mode: a
-        step by it may go any distance. All else of the step is right, and pushes bodies along these
-        modes as far as gaps close by it.
+        At a solution the regularisation nearly vanishes, and these components may be arbitrarily
+        large. They become the least ones without penetration by the rest of the step.
 
         Args:
             system: The system.
-            present: The state from which the step is.
-            way: The step.
+            present: The state before the step.
+            step: The step.
         """
         equations, full, motions = self._equations, self._equations.full, self._equations.motions
         modes = motions.in_free(equations.regularised_modes)
         if not len(modes):
-            return way
+            return step
         comm = full.unknowns.comm
         free = [np.where(full.constrained, 0.0, field) for field in motions.present_fields()]
-        every = np.array([system.part(field) for field in free])
-        fields = modes @ every
-        sums = global_sum(comm, np.column_stack([fields @ fields.T, fields @ way]))
-        share = broadcast_from_root(
+        all_modes = np.array([system.part(field) for field in free])
+        fields = modes @ all_modes
+        sums = global_sum(comm, np.column_stack([fields @ fields.T, fields @ step]))
+        coefficients = broadcast_from_root(
             comm, np.linalg.lstsq(sums[:, :-1], sums[:, -1], rcond=NEGLIGIBLE)[0]
         )
-        way = way - share @ fields
+        step = step - coefficients @ fields
         system.set_state(present)
-        states, bear, closed = [], [], []
+        states, has_force, closing = [], [], []
         for number, operator in enumerate(system.operators):
             contact, values = operator.contact, operator.contact.states.evaluate_present()
             committed = contact.states.committed.points or values
-            bear.append(motions.has_force(number, contact, committed)[0])
+            has_force.append(motions.has_force(number, contact, committed)[0])
             normal = np.where(np.isfinite(values.normal), values.normal, 0.0)
-            closed.append(np.einsum("qd,qd->q", operator.jump(way), normal))
+            closing.append(np.einsum("qd,qd->q", operator.jump(step), normal))
             states.append(values)
-        nothing, among = np.zeros(len(motions.free)), [~each for each in bear]
-        pushed = find_least_motion(full, motions, modes, states, nothing, among, closed)
-        return way if pushed is None else way + pushed @ every
+        zeros, may_close = np.zeros(len(motions.free)), [~each for each in has_force]
+        least = find_least_motion(full, motions, modes, states, zeros, may_close, closing)
+        return step if least is None else step + least @ all_modes

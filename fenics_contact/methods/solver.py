@@ -425,7 +425,7 @@ class Solver:
 
     def _forget_matrices(self) -> None:
         self.equations.forget_matrices()
-        self.predictor.forget()
+        self.predictor.invalidate_tangent()
 
     # ---- solving ---------------------------------------------------------------------------------
 
@@ -455,15 +455,15 @@ class Solver:
         equations.is_round_off_known, equations.overload = False, None
         equations.generalised_loads = equations.motions.generalised_load(self._full.load)
 
-        def iterate(first_round: bool) -> tuple[int, list[Attempt]]:
-            changed = first_round and stiffness_changed
-            return self._iterate(first_round, cold, changed, balance=balance, fallback=fallback)
+        def iterate(first_augmentation: bool) -> tuple[int, list[Attempt]]:
+            changed = first_augmentation and stiffness_changed
+            return self._iterate(first_augmentation, cold, changed, balance=balance, fallback=fallback)
 
         return solve_augmented_lagrangian(equations, iterate, load_before)
 
     def _iterate(
         self,
-        first_round: bool,
+        first_augmentation: bool,
         cold: bool,
         stiffness_changed: bool,
         *,
@@ -478,7 +478,7 @@ class Solver:
         equations = self.equations
         factored = self.predictor.factored
         equations.monitor.reset()
-        chosen = self.predictor.choose(first_round=first_round, cold=cold)
+        chosen = self.predictor.choose_initial_guess(first_augmentation=first_augmentation, cold=cold)
         start: Array = np.divide(chosen, equations.length)
         attempts: list[Attempt] = []
         methods: Iterable[str] = self._chain(start, fallback=fallback, balance=balance)
@@ -506,7 +506,7 @@ class Solver:
         if reason > 0 and newton and (factored or made > 0):
             # With a linear bulk a start by the tangent comes first even where it is far off, which
             # a load that falls to nothing does not forgive after continuation.
-            self.predictor.keep(predict=own is None or not self._full.bulk.linear)
+            self.predictor.store_solution(predict=own is None or not self._full.bulk.linear)
         return int(reason), attempts
 
     def _chain(self, start: Array, *, fallback: bool, balance: bool) -> Iterator[str]:
@@ -557,7 +557,7 @@ class Solver:
             self.change(anew=True)
         # After a history that was taken up and is at its end nothing has been assembled yet.
         self.update_system(self._full.update_stiffness())
-        self.predictor.forget()  # the matrix that is about to be used is another one
+        self.predictor.invalidate_tangent()  # the matrix that is about to be used is another one
         self.system.begin(load)
         return linearised_solver(self.equations, springs)
 
@@ -595,7 +595,7 @@ class Solver:
                 springs = [
                     c.values.springs(s, s) for c, s in zip(full.contacts, closed, strict=True)
                 ]
-                self.predictor.forget()  # the matrix that is about to be used is another one
+                self.predictor.invalidate_tangent()  # the matrix that is about to be used is another one
                 with linearised_solver(self.equations, springs, prescribed=moved) as solve:
                     return present + solve(None)
             finally:
