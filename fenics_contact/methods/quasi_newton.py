@@ -1,4 +1,4 @@
-"""The quasi-Newton method: L-BFGS in rounds, H₀ made anew between them (section 5)."""
+"""L-BFGS with restarts, at which H₀ is assembled again (section 5)."""
 
 from __future__ import annotations
 
@@ -14,34 +14,30 @@ from fenics_contact.methods.method import SnesMethod
 
 __all__ = ["QuasiNewton"]
 
-# Rounds in a row that do not lower the residual before the increment is given up: the potential may
-# fall for long before the residual does.
+# Consecutive restarts without a lower residual: the potential may decrease long before it does.
 _MAX_STALLS = 10
-# The same where friction does not bear the load by the present pressures.
-_FEW_STALLS = 3
-# Contact that bears less than this share of the residual an increment begins with tells nothing of
-# which points will be closed.
-_IDLE = 1e-3
-# A round that ends with more than this times the lowest residual, or none, has gone astray: the
-# next one starts where that was.
-_ASTRAY = 1e3
+_MAX_OVERLOAD_STALLS = 3  # with an overload of friction at the present pressures
+# Contact force by the initial residual below which the initial active set is not used for H₀.
+_UNLOADED_FORCE_RATIO = 1e-3
+# Residual by the least one from which on the iteration has diverged and returns to the latter.
+_DIVERGED_RATIO = 1e3
 
 _REASONS = PETSc.SNES.ConvergedReason
 
 
 class QuasiNewton(SnesMethod):
-    """The method; SNES makes a round, whose limit of iterations is its own."""
+    """L-BFGS; SNES iterates between restarts, with an iteration limit of its own."""
 
     def __init__(
         self, equations: Equations, snes: PETSc.SNES, can_hand_over: Callable[[], bool]
     ) -> None:
         super().__init__(equations, snes, can_hand_over)
         self._limit: int | None = None
-        self._refreshed = False
+        self._has_active_set = False
 
     @classmethod
     def main_options(cls) -> Mapping[str, Any]:
-        """See `Method.main_options`."""
+        """Return options of L-BFGS."""
         return {
             "snes_type": "qn",
             "snes_qn_type": "lbfgs",
@@ -53,7 +49,7 @@ class QuasiNewton(SnesMethod):
 
     @property
     def max_it(self) -> int:
-        """Iterations in all before it is given up."""
+        """Maximum number of iterations over all restarts."""
         return super().max_it if self._limit is None else self._limit
 
     @max_it.setter
@@ -61,26 +57,30 @@ class QuasiNewton(SnesMethod):
         self._limit = limit
 
     def _compute_jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
-        """H₀ is made between the rounds, and kept during one."""
+        """Do nothing: H₀ is assembled at restarts."""
 
     def solve(self) -> tuple[int, int]:
-        """See `Method.solve`. The reason is after a look at the residual itself."""
+        """Solve the equations; the reason is that of the residual, not of SNES. Collective."""
         equations, snes = self._equations, self.snes
-        limit = self._limit = self.max_it  # SNES has that of a round from now on
+        limit = self._limit = self.max_it  # the limit of SNES is per restart from now on
         solution = equations.solution
         norms = equations.residual(solution, equations.function)
-        borne = norms.force[norms.n_bodies :].max(initial=0.0)
-        idle = borne < _IDLE * norms.total
-        # Multigrid follows at once, a factorisation is kept.
-        if equations.uses_v_cycle or not equations.is_h0_current or (idle and self._refreshed):
-            self._start(idle=idle)
+        contact_force = norms.force[norms.n_bodies :].max(initial=0.0)
+        unloaded = contact_force < _UNLOADED_FORCE_RATIO * norms.total
+        # Multigrid is inexpensive to set up again, a factorisation is reused.
+        if (
+            equations.uses_v_cycle
+            or not equations.is_h0_current
+            or (unloaded and self._has_active_set)
+        ):
+            self._assemble_first_h0(unloaded=unloaded)
         else:
-            self._clear_pairs(consistent=self.consistent)
+            self._clear_updates(consistent=self.consistent)
         iterations = stalls = 0
-        best, kept = np.inf, solution.copy()
+        best, best_solution = np.inf, solution.copy()
         while True:
-            left = limit - iterations
-            snes.setTolerances(max_it=min(equations.system.iterations_per_round, left))
+            remaining = limit - iterations
+            snes.setTolerances(max_it=min(equations.system.iterations_per_round, remaining))
             iterations += self._callbacks.solve(snes, solution)[0]
             residual = equations.residual(solution, equations.function).total
             if equations.solved():
@@ -89,57 +89,57 @@ class QuasiNewton(SnesMethod):
                 return iterations, int(_REASONS.DIVERGED_MAX_IT)
             if residual < best:
                 stalls, best = 0, residual
-                solution.copy(kept)
+                solution.copy(best_solution)
             else:
                 stalls += 1
-                if not residual <= _ASTRAY * best:
-                    kept.copy(solution)
+                if not residual <= _DIVERGED_RATIO * best:
+                    best_solution.copy(solution)
             if stalls >= _MAX_STALLS:
-                lost = not np.isfinite(residual)
-                failure = compat.NOT_FINITE if lost else int(_REASONS.DIVERGED_LINE_SEARCH)
+                diverged = not np.isfinite(residual)
+                failure = compat.NOT_FINITE if diverged else int(_REASONS.DIVERGED_LINE_SEARCH)
                 return iterations, failure
-            if not self._refresh():
+            if not self._assemble_h0():
                 return iterations, compat.NOT_FINITE
-            may_hand_over = stalls >= _FEW_STALLS and self.can_hand_over()
-            if may_hand_over and equations.find_overload() is not None:
+            stalled = stalls >= _MAX_OVERLOAD_STALLS and self.can_hand_over()
+            if stalled and equations.find_overload() is not None:
                 return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
 
-    def _start(self, *, idle: bool) -> None:
-        """Begin with H₀ of the status at the start, or of all of Γc where that tells nothing.
+    def _assemble_first_h0(self, *, unloaded: bool) -> None:
+        """Assemble H₀ with the initial active set, or with all of Γc sticking. Collective.
 
-        Collective. A rigid ball on a block, pressed by a given depth, overlaps where it is going
-        to touch: a third to a half of the iterations are saved.
+        With a prescribed displacement the initial penetration indicates the contact zone, which
+        saves a third to a half of the iterations.
 
         Args:
-            idle: Whether contact bears next to nothing there.
+            unloaded: Whether the contact force is negligible.
         """
         equations = self._equations
-        self._clear_pairs(consistent=False)
+        self._clear_updates(consistent=False)
         equations.evaluate(equations.solution)
-        self._refreshed = not idle and equations.is_constrained()
-        equations.assemble_h0(everywhere=not self._refreshed)
+        self._has_active_set = not unloaded and equations.is_constrained()
+        equations.assemble_h0(everywhere=not self._has_active_set)
 
-    def _refresh(self) -> bool:
-        """Make H₀ anew from the status that the last round reached; False if none. Collective.
+    def _assemble_h0(self) -> bool:
+        """Assemble H₀ with the present active set; return whether it is finite. Collective.
 
-        With Coulomb friction it is the consistent tangent: what L-BFGS cannot build from pairs is
-        the unsymmetric coupling of slip to pressure, and without it the residual wanders.
+        With Coulomb friction it is the consistent tangent: updates of L-BFGS cannot represent the
+        unsymmetric coupling of slip to pressure, without which it does not converge.
         """
         equations = self._equations
         equations.evaluate(equations.solution)
         if not np.isfinite(equations.full.bulk.scale):
             return False
-        self._refreshed = True
+        self._has_active_set = True
         tangent = not equations.has_potential and equations.is_constrained()
         springs = equations.stiffnesses(everywhere=False)
         parts = equations.regularised_tangents() if tangent else springs
         consistent = tangent and not equations.uses_v_cycle
-        self._clear_pairs(consistent=consistent)
+        self._clear_updates(consistent=consistent)
         equations.assemble(equations.matrix(consistent), parts)
         return True
 
-    def _clear_pairs(self, *, consistent: bool) -> None:
-        """Forget the pairs of L-BFGS and keep the factorisation, which reset() would drop too."""
+    def _clear_updates(self, *, consistent: bool) -> None:
+        """Delete the L-BFGS updates, but not the factorisation, which reset() would delete, too."""
         self.snes.setKSP(PETSc.KSP().create(self.snes.comm))
         self.snes.reset()
         self.attach(consistent=consistent)

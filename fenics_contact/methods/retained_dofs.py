@@ -1,4 +1,4 @@
-"""Which unknowns are retained where a problem is condensed: those that contact may touch."""
+"""Selection of the unknowns retained in static condensation: those that contact may couple."""
 
 from __future__ import annotations
 
@@ -15,152 +15,151 @@ from fenics_contact.types import Array, Indices
 
 __all__ = ["RetainedDofs"]
 
-
-# What is retained grows by this factor, lest it grows often.
-_GROWTH = 2
+_GROWTH_FACTOR = 2  # of the number of retained dofs, so that extensions are rare
 
 
 class RetainedDofs:
-    """The unknowns that are retained.
+    """The retained unknowns.
 
-    All that contact touches, if that is little; else those where bodies are nearest to each other,
-    and more where it turns out that contact spreads beyond them. The constructor is collective.
+    They are all unknowns coupled by contact if these are few, otherwise those of the least gaps,
+    and are extended when contact spreads. The constructor is collective.
 
     Args:
         full: The system on all unknowns.
-        all_that_pay: Whether to keep however many there are, since the caller says so.
+        unlimited: Whether their number is not limited, as condensation was requested.
 
     Attributes:
-        indices: This rank's, ascending.
-        chosen: Whether they were chosen where the first increment starts, or given for it.
+        indices: Local indices, ascending.
+        is_selected: Whether they were selected at the start of the first increment, or restored.
     """
 
-    def __init__(self, full: FullSystem, *, all_that_pay: bool) -> None:
-        self._full, self._all_that_pay = full, all_that_pay
-        self.indices = self._nearest()
-        self.chosen = False
-        # For `change`: the dofs to retain, or the distances of the last solution's points from
-        # contact.
+    def __init__(self, full: FullSystem, *, unlimited: bool) -> None:
+        self._full, self._unlimited = full, unlimited
+        self.indices = self._select_nearest()
+        self.is_selected = False
+        # For `update`: the dofs to retain, or the distances of points from contact in the solution.
         self._next: Indices | None = None
-        self._away: list[Array] | None = None
+        self._distances: list[Array] | None = None
 
     @property
     def count(self) -> int:
-        """How many, on all ranks. Collective."""
+        """Number of retained unknowns on all ranks. Collective."""
         return self._count(self.indices)
 
     @property
     def is_all(self) -> bool:
-        """Whether contact touches so little now that all of it is retained. Collective."""
-        return self._is_little(self.touched())
+        """Whether the coupled unknowns are few, so that all are retained. Collective."""
+        return self._is_small(self.find_coupled())
 
-    def touched(self) -> Indices:
-        """This rank's unknowns that contact touches now. Collective."""
+    def find_coupled(self) -> Indices:
+        """Find the local unknowns that contact couples with the present pairs. Collective."""
         return touched(self._full.operators, self._full.unknowns)
 
     def _count(self, indices: Indices) -> int:
         return int(self._full.unknowns.comm.allreduce(indices.size))
 
-    def _is_little(self, everything: Indices) -> bool:
-        return all_retained(self._full.unknowns.n_global, self._count(everything), self._full.gdim)
+    def _is_small(self, coupled: Indices) -> bool:
+        return all_retained(self._full.unknowns.n_global, self._count(coupled), self._full.gdim)
 
-    def _nearest(self, at_least: int = 0, away: Sequence[Array] | None = None) -> Indices:
-        """Unknowns to keep: where bodies are nearest to each other. Collective.
+    def _select_nearest(self, at_least: int = 0, gaps: Sequence[Array] | None = None) -> Indices:
+        """Select the unknowns of the points nearest to contact. Collective.
 
         Args:
-            at_least: About how many, if they are more than come for nothing.
-            away: How far points are from bearing; by default at the present state.
+            at_least: Approximate number, unless more are inexpensive.
+            gaps: Distances of points from contact; by default at the present state.
         """
-        everything = self.touched()
-        if self._is_little(everything):
-            return everything
-        if away is None:
+        coupled = self.find_coupled()
+        if self._is_small(coupled):
+            return coupled
+        if gaps is None:
             self._full.evaluate()
-            away = [distances(contact) for contact in self._full.contacts]
-        for_nothing = inexpensive(self._full.unknowns.n_global, self._full.gdim)
+            gaps = [distances(contact) for contact in self._full.contacts]
+        n_inexpensive = inexpensive(self._full.unknowns.n_global, self._full.gdim)
         return nearest(
             self._full.operators,
             self._full.unknowns,
-            away,
-            max(at_least, for_nothing),
+            gaps,
+            max(at_least, n_inexpensive),
             NEGLIGIBLE * self._full.scales.mesh_size,
         )
 
-    def _grown(self, away: Sequence[Array] | None, *, anew: bool) -> Indices:
-        """More unknowns than are retained now. Collective.
-
-        Contact that travels comes back, and all that was retained is so for as long as it pays.
+    def _select_more(self, gaps: Sequence[Array] | None, *, can_drop: bool) -> Indices:
+        """Select more unknowns, including the present ones as long as it is worthwhile. Collective.
 
         Args:
-            away: See `_nearest`.
-            anew: Whether those retained now may be dropped where they would be too many.
+            gaps: Distances of points from contact; by default at the present state.
+            can_drop: Whether the present ones may be dropped if there are too many.
         """
-        before, n = self.indices, self.count
-        retained = before
-        for at_least in (_GROWTH * n, 0):
-            retained = np.union1d(before, self._nearest(at_least, away)).astype(np.int32)
+        present, n = self.indices, self.count
+        retained = present
+        for at_least in (_GROWTH_FACTOR * n, 0):
+            retained = np.union1d(present, self._select_nearest(at_least, gaps)).astype(np.int32)
             if self._count(retained) == n:
-                retained = self.touched()
-            if self._all_that_pay or self._pays(retained):
+                retained = self.find_coupled()
+            if self._unlimited or self._is_worthwhile(retained):
                 return retained
-        return self._nearest(0, away) if anew else retained
+        return self._select_nearest(0, gaps) if can_drop else retained
 
-    def _pays(self, retained: Indices) -> bool:
+    def _is_worthwhile(self, retained: Indices) -> bool:
         return worthwhile(self._full.unknowns.n_global, self._count(retained), self._full.gdim)
 
-    def grows(self) -> bool:
-        """Keep all that contact touches with other pairs, if that is little. Collective.
+    def extend(self) -> bool:
+        """Add all unknowns coupled by new pairs if they are few. Collective.
 
-        A body that slides comes back to places where it was: what is retained grows only.
+        None are dropped, as a sliding body may return.
 
         Returns:
-            Whether it has grown.
+            Whether there are more unknowns.
         """
-        everything = self.touched()
-        if not self._is_little(everything):
+        coupled = self.find_coupled()
+        if not self._is_small(coupled):
             return False
         n = self.count
-        self.indices = np.union1d(self.indices, everything).astype(np.int32)
+        self.indices = np.union1d(self.indices, coupled).astype(np.int32)
         return self.count > n
 
     def select_dofs(self, *, other_pairs: bool) -> bool:
-        """Whether an increment that starts here takes other unknowns; then `change`. Collective.
+        """Return whether `update` has to be called at the start of the increment. Collective.
 
         Args:
-            other_pairs: Whether points have other opposites than those retained are of.
+            other_pairs: Whether the pairs have changed since the last selection.
         """
         comm = self._full.unknowns.comm
         self._next = None
-        if not self.chosen:
-            self.chosen, found = True, self._nearest()
-            if comm.allreduce(int(not np.array_equal(found, self.indices))):
-                self._next = found
+        if not self.is_selected:
+            self.is_selected, indices = True, self._select_nearest()
+            if comm.allreduce(int(not np.array_equal(indices, self.indices))):
+                self._next = indices
         elif other_pairs and not self.is_all:
-            bearing = [active_points(contact) for contact in self._full.contacts]
-            needed = touched(self._full.operators, self._full.unknowns, bearing)
-            if comm.allreduce(np.setdiff1d(needed, self.indices).size):
-                self._next = self._grown(None, anew=True)
+            active = [active_points(contact) for contact in self._full.contacts]
+            required = touched(self._full.operators, self._full.unknowns, active)
+            if comm.allreduce(np.setdiff1d(required, self.indices).size):
+                self._next = self._select_more(None, can_drop=True)
         return self._next is not None
 
-    def needs_more_dofs(self, operators: Sequence[ContactOperator], *, found: bool) -> bool:
-        """Whether contact acts on more unknowns than are retained. Collective.
+    def needs_more_dofs(self, operators: Sequence[ContactOperator], *, has_solution: bool) -> bool:
+        """Return whether contact acts on further unknowns. Collective.
 
         Args:
-            operators: Contacts over those retained.
-            found: Whether there is a solution; if so contacts are evaluated on all of Γc.
+            operators: Operators of the contacts over the retained unknowns.
+            has_solution: Whether there is a solution, with contacts evaluated on all of Γc.
         """
-        outside = False
+        acts_outside = False
         for operator in operators:
             if operator.within is not None:
-                outside |= bool(np.any(active_points(operator.contact) & ~operator.within))
+                acts_outside |= bool(np.any(active_points(operator.contact) & ~operator.within))
         self._next = None
-        self._away = [distances(c) for c in self._full.contacts] if found else None
-        return bool(self._full.unknowns.comm.allreduce(int(outside)))
+        self._distances = [distances(c) for c in self._full.contacts] if has_solution else None
+        return bool(self._full.unknowns.comm.allreduce(int(acts_outside)))
 
-    def change(self, *, anew: bool) -> None:
-        """Keep what `select_dofs` or `needs_more_dofs` found to be needed. Collective.
+    def update(self, *, can_drop: bool) -> None:
+        """Retain the unknowns required by `select_dofs` or `needs_more_dofs`. Collective.
 
         Args:
-            anew: Whether those retained now may be dropped where they would be too many.
+            can_drop: Whether the present ones may be dropped if there are too many.
         """
-        self.indices = self._grown(self._away, anew=anew) if self._next is None else self._next
+        self.indices = (
+            self._select_more(self._distances, can_drop=can_drop)
+            if self._next is None
+            else self._next
+        )

@@ -168,7 +168,7 @@ class Solver:
         self._comm = full.unknowns.comm
         self._obstacle: str | None = None  # to condensation, as last said
         self._pairings = self._present_pairings()  # those of the system
-        self._retained = RetainedDofs(full, all_that_pay=bool(settings.condensation))
+        self._retained = RetainedDofs(full, unlimited=bool(settings.condensation))
         # What is chosen and made by `_configure`, for the increments that are expected.
         self.options = Defaults()
         self._named: list[str] = []  # options given that name a linear solver
@@ -351,7 +351,7 @@ class Solver:
     def update_system(self, stiffness_changed: bool) -> None:
         """Follow changes of the pairs and of the bulk's tangent. Collective."""
         if self._pairings != self._present_pairings():
-            if not self.condensed or self._retained.grows():
+            if not self.condensed or self._retained.extend():
                 self._set_system()
             self._pairings = self._present_pairings()
             self._make_matrices()
@@ -376,7 +376,7 @@ class Solver:
         """
         if not self.system.confined:
             return False
-        misses = self._retained.needs_more_dofs(self.system.operators, found=found)
+        misses = self._retained.needs_more_dofs(self.system.operators, has_solution=found)
         # A body that nothing else holds may find no rest on what is retained.
         return misses or (not found and len(self.equations.motions.free) > 0)
 
@@ -388,7 +388,7 @@ class Solver:
         Args:
             anew: Whether what is retained now may be dropped where all would be too much.
         """
-        self._retained.change(anew=anew)
+        self._retained.update(can_drop=anew)
         if self._choose_condensation() != self.condensed:
             self._configure_anew()
         elif self.condensed:
@@ -403,9 +403,9 @@ class Solver:
             self._retained.indices = retained
             self._set_system()
         elif anew and not self._retained.is_all:
-            self._retained.indices = retained if some else self._retained.touched()
+            self._retained.indices = retained if some else self._retained.find_coupled()
             self._configure_anew()
-        self._retained.chosen = True
+        self._retained.is_selected = True
 
     def restart(self) -> None:
         """Drop what is retained from earlier increments. Collective."""
