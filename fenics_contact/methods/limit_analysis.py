@@ -21,10 +21,10 @@ from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Index
 
-__all__ = ["CLEAR_OVERLOAD_FACTOR", "Overload", "find_overload"]
+__all__ = ["CLEAR_FACTOR", "Overload", "find_overload"]
 
 # Factor of an `Overload` from which on inexact pressures are no explanation of it.
-CLEAR_OVERLOAD_FACTOR = 1.02
+CLEAR_FACTOR = 1.02
 # Cutting planes, and relative tolerance of the largest overload factor.
 _MAX_PLANES, _FACTOR_TOLERANCE = 200, 1e-3
 # Bound of the coefficients, which are of order one unless friction does not resist the mode.

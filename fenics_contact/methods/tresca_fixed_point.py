@@ -1,14 +1,12 @@
-"""Minimum problems one after another: contact with friction of given limit, then a new limit.
+"""Fixed-point iteration on the friction bound of a sequence of Tresca problems.
 
-Coulomb's law has no potential. With a given friction bound, unilateral contact with friction has
-one (Signorini with Tresca or Duvaut-Lions, section 3): Newton's method with a line search on the
-energy solves it however stiff it is. The pressure that comes out sets the next bound, until the
-whole law holds. Each cycle gains a factor, which is constant once no point changes its status, and
-the less the larger the friction is.
+Coulomb's law has no potential, but contact with a given friction bound has one (Signorini with
+Tresca or Duvaut-Lions, section 3): Newton's method with a line search on the energy minimises it,
+however stiff the contact is. Its pressure gives the next bound. Convergence is linear with a
+constant active set, and slower with larger friction.
 
-The paper's conclusion takes the normal and the tangential reaction apart, one given while the other
-is sought. A body that contact alone holds is loose in either of these problems, and each has to
-wait for the other where both change; here only the friction bound waits.
+The paper instead alternates between normal and tangential problems, in each of which a body that
+only contact constrains has unconstrained modes.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
-from fenics_contact.methods.limit_analysis import CLEAR_OVERLOAD_FACTOR
+from fenics_contact.methods.limit_analysis import CLEAR_FACTOR
 from fenics_contact.methods.method import SnesMethod, SolverContext, StandaloneMethod
 from fenics_contact.types import Array
 
@@ -40,37 +38,32 @@ _OPTIONS = {
     "snes_linesearch_type": "bt",
     "snes_linesearch_max_it": 40,
 }
-# Newton steps without line search finish where the energy has no digits left.
+# Newton steps without line search, for decreases below the round-off of the energy.
 _FINISH = _OPTIONS | {"snes_max_it": 5, "snes_linesearch_type": "basic"}
-# Round-off of the energy, by the size of its terms; and residual, as a share of the forces, from
-# which on its differences are not far above that: no line search tells a descent there.
-_NOISE, _NEAR = 10 * np.finfo(float).eps, 1e-6
-# Cycles, and Newton iterations in all, before it is given up; and cycles in a row that may pass
-# without a lower residual.
+# Round-off of the energy by its terms, and residual by the forces below which a decrease of the
+# energy may be round-off.
+_ENERGY_ROUND_OFF, _LINE_SEARCH_RTOL = 10 * np.finfo(float).eps, 1e-6
 _MAX_CYCLES = 200
-_MAX_ITERATIONS = 1000
-_MAX_STALLS = 20
-# Cycles without a lower residual after which only half of the change of the limit is taken, and the
-# least share: two cycles may undo one another.
-_PATIENCE = 2
-_LEAST = 1 / 8
-# Where the load needs more friction than there is, the problem with the limit given has no solution
-# but with this much more than it needs. It is believed after so many cycles in a row that find so;
-# if that is clear, after the second, whose pressures are those of an equilibrium.
-_MORE, _OVERLOADS = 1.01, 3
-# Share of the whole law's residual to which a subproblem is solved: more would be lost again.
-_INNER = 1e-2
-# Share of k_t that keeps a slipping body in place in the matrix (not in the equations).
-_STILL = 1e-6
+_MAX_ITERATIONS = 1000  # Newton iterations of all cycles
+_MAX_STALLS = 20  # consecutive cycles without a lower residual
+# Stalled cycles after which the relaxation of the bound is halved, and its least value.
+_STALLS_TO_RELAX = 2
+_MIN_RELAXATION = 1 / 8
+# With an overload the bound is raised to this multiple of the required one, else the subproblem has
+# no solution. The overload is accepted after consecutive cycles; a clear one after the second,
+# whose pressures are in equilibrium.
+_OVERLOAD_BOUND_FACTOR, _OVERLOADS = 1.01, 3
+_SUBPROBLEM_RTOL = 1e-2  # residual of a subproblem by that of the complete law
+_SLIP_STIFFNESS_RATIO = 1e-6  # of k_t, regularises the matrix of slipping bodies
 
 _REASONS = PETSc.SNES.ConvergedReason
 
 
 class TrescaFixedPoint(StandaloneMethod):
-    """The method.
+    """Fixed-point iteration on the friction bound.
 
     Attributes:
-        snes: Newton's method for the subproblems, prefix "alternating_" behind the problem's.
+        snes: Newton's method for the subproblems; its prefix ends in "alternating_".
     """
 
     def __init__(self, context: SolverContext) -> None:
@@ -80,7 +73,7 @@ class TrescaFixedPoint(StandaloneMethod):
         self.snes = self._search.snes
 
     def solve(self) -> tuple[int, int]:
-        """See `Method.solve`. Iterations are Newton's, in all."""
+        """Solve the equations; return all Newton iterations and the reason. Collective."""
         equations = self._equations
         if not self.suits:
             return 0, int(_REASONS.DIVERGED_LINE_SEARCH)
@@ -94,21 +87,23 @@ class TrescaFixedPoint(StandaloneMethod):
             bound: Array = self._friction_bound()
             for cycle in range(_MAX_CYCLES):
                 overload = equations.find_overload()
-                needed = overload.factor if overload else 1.0
-                overloads = overloads + 1 if 1.0 < needed < np.inf else 0
-                # Limits that the pressure does not set are what they are.
-                enough = 1 if equations.has_potential else 2 if needed > CLEAR_OVERLOAD_FACTOR else _OVERLOADS
+                factor = overload.factor if overload else 1.0
+                overloads = overloads + 1 if 1.0 < factor < np.inf else 0
+                # A bound independent of the pressure does not change.
+                enough = (
+                    1 if equations.has_potential else 2 if factor > CLEAR_FACTOR else _OVERLOADS
+                )
                 if overloads >= enough:
                     logger.debug("%d cycles, %d Newton iterations: overload", cycle, iterations)
                     equations.overload = overload
                     return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
                 if overloads:
-                    bound = _MORE * needed * bound
+                    bound = _OVERLOAD_BOUND_FACTOR * factor * bound
                 ends = np.cumsum([c.quadrature.n_points for c in equations.contacts])[:-1]
                 for contact, part in zip(equations.contacts, np.split(bound, ends), strict=True):
                     contact.effective_law.fix_friction_bound(part)
-                share = 0.0 if equations.has_potential else _INNER
-                self._search.goal = self._finish.goal = share * residual
+                rtol = 0.0 if equations.has_potential else _SUBPROBLEM_RTOL
+                self._search.atol = self._finish.atol = rtol * residual
                 iterations += self._minimise()
                 residual = self._residual()
                 if equations.solved():
@@ -120,8 +115,8 @@ class TrescaFixedPoint(StandaloneMethod):
                     return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
                 if iterations > _MAX_ITERATIONS:
                     return iterations, int(_REASONS.DIVERGED_MAX_IT)
-                if stalls and stalls % _PATIENCE == 0:
-                    relaxation = max(relaxation / 2, _LEAST)
+                if stalls and stalls % _STALLS_TO_RELAX == 0:
+                    relaxation = max(relaxation / 2, _MIN_RELAXATION)
                 bound = bound + relaxation * (self._friction_bound() - bound)
             return iterations, int(_REASONS.DIVERGED_MAX_IT)
         finally:
@@ -130,17 +125,17 @@ class TrescaFixedPoint(StandaloneMethod):
                 contact.effective_law.release_friction_bound()
 
     def check(self) -> None:
-        """Refuse problems without a potential: this method minimises energies."""
+        """Check that the problem with a given friction bound has a potential."""
         if self._equations.full.displacement.mixed:
             raise ValueError(
                 "method is 'alternating', but u is a part of a mixed function, whose equations are "
-                "a saddle-point problem and no minimisation; use another method"
+                "a saddle-point problem, not a minimisation; use another method"
             )
-        none = self._without_potential()
-        if none:
-            laws = ", ".join(type(c.law).__name__ for c in none)
+        refused = self._without_potential()
+        if refused:
+            laws = ", ".join(type(c.law).__name__ for c in refused)
             why = "not even with a given friction bound"
-            if all(c.finite for c in none):
+            if all(c.finite for c in refused):
                 why = "with finite kinematics, because the tangent planes rotate"
             raise ValueError(
                 f"method is 'alternating', but {laws} has no potential, {why}, so that there is "
@@ -149,7 +144,7 @@ class TrescaFixedPoint(StandaloneMethod):
 
     @property
     def suits(self) -> bool:
-        """See `StandaloneMethod.suits`."""
+        """Whether the method applies to the problem."""
         mixed = self._equations.full.displacement.mixed
         return bool(self._equations.contacts) and not mixed and not self._without_potential()
 
@@ -157,50 +152,50 @@ class TrescaFixedPoint(StandaloneMethod):
         return [c for c in self._equations.contacts if not c.effective_law.can_fix_friction_bound]
 
     def _friction_bound(self) -> Array:
-        """Friction bound of all contacts at this rank's points (stress)."""
+        """Evaluate the friction bound of all contacts at the local points (stress)."""
         equations = self._equations
         equations.full.evaluate()
         return np.concatenate([contact.values.friction_bound for contact in equations.contacts])
 
     def _residual(self) -> float:
-        """That of the whole law."""
+        """Compute the norm of the residual with the complete law."""
         equations = self._equations
         for contact in equations.contacts:
             contact.effective_law.release_friction_bound()
         return float(equations.residual(equations.solution, equations.function).total)
 
     def _minimise(self) -> int:
-        """Newton's method with the line search on the energy, then without any."""
-        made, reason = self._search.solve()
+        """Solve the subproblem with a line search on the energy, then without; iterations."""
+        iterations, reason = self._search.solve()
         if reason <= 0:
-            # The last digits of the residual are below the rounding of the energy.
-            made += self._finish.solve()[0]
-        return made
+            # The last digits of the residual are below the round-off of the energy.
+            iterations += self._finish.solve()[0]
+        return iterations
 
 
 class _Minimisation(SnesMethod):
-    """Newton's method for the problems that are solved one after another, with the matrix of H₀.
+    """Newton's method for the subproblems, with the matrix of H₀.
 
     The constructor is collective.
 
     Args:
-        context: What it is made of.
-        part: What follows the prefix of the problem's options in that of this one.
-        options: Those of SNES.
+        context: Data to construct the SNES.
+        part: Part of the prefix of the SNES after the problem's.
+        options: Options of the SNES.
 
     Attributes:
-        goal: Residual to which the present one is solved (force).
+        goal: Tolerance of the residual of the present subproblem (force).
     """
 
     def __init__(self, context: SolverContext, part: str, options: Mapping[str, Any]) -> None:
         snes, own = context.snes(part, options, consistent=False)
         super().__init__(context.equations, snes, lambda: False, own_solver=own)
-        self.goal = 0.0
+        self.atol = 0.0
 
     def converged(self) -> int:
-        """See `SnesMethod.converged`."""
+        """Return the SNES reason of the convergence test."""
         equations = self._equations
-        converged = equations.norms.total <= self.goal or equations.solved()
+        converged = equations.norms.total <= self.atol or equations.solved()
         return int(_REASONS.CONVERGED_FNORM_RELATIVE if converged else _REASONS.ITERATING)
 
     def _compute_jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
@@ -209,31 +204,32 @@ class _Minimisation(SnesMethod):
         if not equations.is_constrained():
             equations.assemble(J, equations.stiffnesses(everywhere=True))
             return
-        # Where all slips, what nothing but friction holds would be loose.
-        still = (
-            o.springs(o.contact.values.springs(0.0, _STILL)) for o in equations.system.operators
+        # If all points slip, bodies constrained by friction have unconstrained modes.
+        springs = (
+            o.springs(o.contact.values.springs(0.0, _SLIP_STIFFNESS_RATIO))
+            for o in equations.system.operators
         )
-        equations.assemble(J, chain(equations.tangents(), still))
+        equations.assemble(J, chain(equations.tangents(), springs))
 
 
 class _Search(_Minimisation):
-    """The same with a line search on the energy, where the bulk has one."""
+    """Newton's method with a line search on the energy, for a linear bulk."""
 
     def __init__(self, context: SolverContext, part: str, options: Mapping[str, Any]) -> None:
         super().__init__(context, part, options)
-        # Potential at the state asked for last, and where it was last found to have fallen.
-        self._energy = self._reached = np.inf
+        # Potential at the last state, and at the last iterate.
+        self._energy = self._last_energy = np.inf
 
     def attach(self, *, consistent: bool) -> None:
-        """See `SnesMethod.attach`."""
+        """Set callbacks, objective and the linear solver in SNES."""
         super().attach(consistent=consistent)
         this: _Search = weakref.proxy(self)
         if self._equations.full.bulk.linear:
             self._callbacks.set_objective(self.snes, lambda x: this._compute_energy(x))
 
     def solve(self) -> tuple[int, int]:
-        """See `Method.solve`."""
-        self._energy = self._reached = np.inf
+        """Solve the subproblem. Collective."""
+        self._energy = self._last_energy = np.inf
         return super().solve()
 
     def _compute_energy(self, x: PETSc.Vec) -> float:
@@ -241,17 +237,14 @@ class _Search(_Minimisation):
         return self._energy
 
     def converged(self) -> int:
-        """See `SnesMethod.converged`; an end, too, where the energy has no digits left. Collective.
-
-        Differences of these tell no descent.
-        """
+        """Return the SNES reason, also an end at the round-off of the energy. Collective."""
         reason, ongoing = super().converged(), int(_REASONS.ITERATING)
-        if reason == ongoing and self._equations.solved(_NEAR):
+        if reason == ongoing and self._equations.solved(_LINE_SEARCH_RTOL):
             return int(_REASONS.DIVERGED_LINE_SEARCH)
         if reason != ongoing or not np.isfinite(self._energy):
             return reason
-        fallen = self._reached - self._energy
-        self._reached = self._energy
-        if fallen <= _NOISE * self._equations.energy_size():
+        decrease = self._last_energy - self._energy
+        self._last_energy = self._energy
+        if decrease <= _ENERGY_ROUND_OFF * self._equations.energy_size():
             return int(_REASONS.DIVERGED_LINE_SEARCH)
         return ongoing
