@@ -1,4 +1,4 @@
-"""Bodies that nothing holds yet, before an increment: they are set down on what bears them."""
+"""Initial positioning: bodies that only contact constrains are moved to a rest position."""
 
 from __future__ import annotations
 
@@ -27,51 +27,50 @@ from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["InitialPositioning"]
 
-# Contact forces that sum up to less than this share of the load on a free motion are none yet.
-_IDLE = 1e-3
-# The share of what a load drives that counts as most of it.
-_MOST = 0.5
-# The share of a motion at Γc that may go along a Γc that grips: of a body tilted by up to 0.2.
-_ALONG = 0.05
-# Part of a free motion, squared, that points must feel to take a body along: less is round-off.
-_SHARED = 1e-6
-# Where gaps are not linear in rigid motions a body is set down step by step, in the first of which
-# it turns by this angle at most (radians), in each other one by half of that before; and the last
-# step, by the largest gap, whose square is to be far below `NEGLIGIBLE`.
-_TURN, _STEPS, _LAST = 0.2, 30, 1e-6
+# Contact force by the load on a free mode below which a body counts as unloaded.
+_UNLOADED_FORCE_RATIO = 1e-3
+# Least work of the load in the modes towards contact by that in all modes.
+_MIN_WORK_RATIO = 0.5
+# Largest tangential fraction of a mode on Γc with friction, for tilts of up to 0.2.
+_MAX_TANGENTIAL_FRACTION = 0.05
+# Relative rank tolerance of the Gram matrix of modes at touching points.
+_RANK_TOLERANCE = 1e-6
+# Steps with nonlinear gaps: largest angle of the first (radians), which is halved in each step,
+# their number, and length of the last by the largest gap, with a square far below `NEGLIGIBLE`.
+_FIRST_ANGLE, _MAX_STEPS, _LAST_STEP_RATIO = 0.2, 30, 1e-6
 
 
 @dataclass(frozen=True)
-class _Free:
-    """The free motions that nothing holds, of bodies where they are now, and what they meet there.
+class _FreeModes:
+    """Unconstrained free modes at the present state.
 
     Attributes:
-        which: Their numbers among all free motions, (n_free,).
-        drive: Work of the load on them, by the largest, (n_free,).
-        mass: Their products, (n_free, n_free).
-        jumps: Of every contact what its points feel of them, (n_free, n_points, gdim).
+        modes: Indices among all free modes, (n_free,).
+        load: Generalised load by the largest, (n_free,).
+        gram: Gram matrix of the modes, (n_free, n_free).
+        jumps: Jumps of the modes at the points of every contact, (n_free, n_points, gdim).
     """
 
-    which: Index
-    drive: Array
-    mass: Array
+    modes: Index
+    load: Array
+    gram: Array
     jumps: list[Array]
 
 
-def _feeling(jumps: Array) -> Mask:
-    """Which points feel any motions, by their jumps there, (n_free, n_points, gdim)."""
+def _find_displaced(jumps: Array) -> Mask:
+    """Return the mask of points displaced by modes with the jumps (n_free, n_points, gdim)."""
     return np.asarray(np.abs(jumps).max(axis=(0, 2), initial=0.0) > NEGLIGIBLE)
 
 
 @dataclass(frozen=True)
 class InitialPositioning:
-    """Where bodies without contact come from and go to in an increment.
+    """Initial positioning of bodies without contact in an increment.
 
     Attributes:
         full: The system on all unknowns.
-        motions: Rigid motions of the bodies.
+        motions: Rigid-body modes of the bodies.
         load: External forces at this rank's unknowns (force).
-        before: The state before Dirichlet conditions took their present values.
+        before: The state with the previous values of the Dirichlet conditions.
     """
 
     full: FullSystem
@@ -80,16 +79,15 @@ class InitialPositioning:
     before: Array
 
     def lead(self, *, first: bool) -> bool:
-        """Set bodies that nothing holds yet down, or move them to first touch. Collective.
+        """Move unconstrained bodies to a rest position, or to first touch. Collective.
 
-        One that was released before is set down from where it was left, for that may be far along
-        its obstacle.
+        A body released in an earlier increment starts from its present position.
 
         Args:
             first: Whether it is the first increment.
 
         Returns:
-            Whether nothing was borne before.
+            Whether there was no contact force before.
         """
         full, motions = self.full, self.motions
         if not len(motions.free):
@@ -97,100 +95,99 @@ class InitialPositioning:
         full.evaluate()
         finite = all(contact.finite for contact in full.contacts)
         groups, load_size = motions.groups(), motions.generalised_load(self.load)
-        borne = full.contact_force_sizes(committed=finite)
-        idle = (borne < _IDLE * load_size)[groups] & (not first)
-        untouched = self._untouched()
+        contact_force = full.contact_force_sizes(committed=finite)
+        unloaded = (contact_force < _UNLOADED_FORCE_RATIO * load_size)[groups] & (not first)
+        untouched = self._find_untouched()
         if first:
-            here = full.state()
+            present = full.state()
             with self._obstacles_at_start():
                 full.evaluate_at(self.before)
-                untouched = np.union1d(untouched, self._untouched())
-            full.evaluate_at(here)
+                untouched = np.union1d(untouched, self._find_untouched())
+            full.evaluate_at(present)
         if len(untouched) < len(motions.free) and motions.turning:
-            # Where bodies touch, an obstacle that turns freely follows in the iteration.
+            # With touching bodies freely rotating obstacles are left to the iteration.
             untouched = untouched[motions.of_any_body()[untouched]]
-        which = np.union1d(untouched, np.flatnonzero(idle))
-        # Groups of coupled bodies come to rest apart, and those without load stay.
-        for group in np.unique(groups[which]):
+        modes = np.union1d(untouched, np.flatnonzero(unloaded))
+        # Groups of coupled bodies are positioned separately; unloaded groups stay.
+        for group in np.unique(groups[modes]):
             if load_size[group] > 0:
-                self._set_down(which[groups[which] == group])
-        return first or bool(idle.any())
+                self._position(modes[groups[modes] == group])
+        return first or bool(unloaded.any())
 
-    def _untouched(self) -> Index:
-        """Free motions of what no closed point touches, by their numbers. Collective."""
+    def _find_untouched(self) -> Index:
+        """Find the free modes of bodies without closed points. Collective."""
         contacts, motions = self.full.contacts, self.motions
         touched: Array = np.zeros(len(motions.free))
-        every = self._felt(np.arange(len(motions.free)))[1]
-        for contact, jumps in zip(contacts, every, strict=True):
+        all_jumps = self._evaluate(np.arange(len(motions.free)))[1]
+        for contact, jumps in zip(contacts, all_jumps, strict=True):
             closed = contact.status != Status.OPEN
             touched += (np.abs(jumps[:, closed]) > NEGLIGIBLE).any(axis=(1, 2))
         touched = global_sum(self.full.unknowns.comm, touched)
-        # What turns about a point does not move there.
+        # Rotations about a closed point do not displace it: consider all modes of a body.
         return np.flatnonzero(~(motions.of_same_body() @ (touched > 0)))
 
-    def _set_down(self, which: Index) -> None:
-        """Move bodies that touch nothing to where they rest, or to first touch. Collective.
+    def _position(self, modes: Index) -> None:
+        """Move bodies without contact to a rest position, or to first touch. Collective.
 
-        Slip is counted from where they rest as the increment begins: before prescribed
-        displacements, those of obstacles among them, change. They go along with the obstacles on
-        which they rest then, and to where they rest at the end of the increment.
+        The slip reference is the rest position at the start of the increment, before prescribed
+        displacements and obstacles change. From there bodies follow the obstacles on which they
+        rest, and come to the rest position at the end of the increment.
 
         Args:
-            which: Numbers of their free motions.
+            modes: Indices of their free modes.
         """
         full = self.full
-        aloft = full.state()
-        # An obstacle pressed by a force comes to a body as one that is led there does, and may be
-        # led along by then: slip is counted from where its increment starts.
-        of_bodies = which[self.motions.of_any_body()[which]]
+        initial = full.state()
+        # A free obstacle approaches like a prescribed one: slip counts from its initial position.
+        of_bodies = modes[self.motions.of_any_body()[modes]]
         if len(of_bodies) and any(contact.law.has_friction for contact in full.contacts):
-            along = None
+            coefficients = None
             with self._obstacles_at_start() as motions:
-                full.evaluate_at(np.where(full.constrained, self.before, aloft))
-                if self._find_rest_position(which):
-                    along = self._fit_obstacle_motion(which, motions)
-                    for contact, jumps in zip(full.contacts, self._felt(of_bodies)[1], strict=True):
-                        contact.states.set_slip_reference(_feeling(jumps))
-            full.evaluate_at(aloft)
-            if along is not None:
-                self._move(which, along)
-        self._find_rest_position(which)
+                full.evaluate_at(np.where(full.constrained, self.before, initial))
+                if self._find_rest_position(modes):
+                    coefficients = self._fit_obstacle_motion(modes, motions)
+                    for contact, jumps in zip(
+                        full.contacts, self._evaluate(of_bodies)[1], strict=True
+                    ):
+                        contact.states.set_slip_reference(_find_displaced(jumps))
+            full.evaluate_at(initial)
+            if coefficients is not None:
+                self._displace(modes, coefficients)
+        self._find_rest_position(modes)
         if not full.bulk.linear:
-            full.update_stiffness()  # of a bulk that has turned
+            full.update_stiffness()
 
-    def _fit_obstacle_motion(self, which: Index, obstacles: Sequence[ObstacleMotion]) -> Array:
-        """Fit free motions to the motion of the obstacles that bodies touch. Collective.
-
-        Least squares over the points in touch.
+    def _fit_obstacle_motion(self, modes: Index, obstacles: Sequence[ObstacleMotion]) -> Array:
+        """Fit free modes to the motion of the touched obstacles by least squares. Collective.
 
         Args:
-            which: Numbers of their free motions.
-            obstacles: Motion in the increment of the obstacle of every contact.
+            modes: Indices of the free modes.
+            obstacles: Motion of the obstacle of every contact in the increment.
 
         Returns:
-            Coefficients of the free motions.
+            Coefficients of the free modes.
         """
-        gram: Array = np.zeros((len(which), len(which)))
-        work: Array = np.zeros(len(which))
+        gram: Array = np.zeros((len(modes), len(modes)))
+        work: Array = np.zeros(len(modes))
         scales = self.full.scales
         for number, (contact, jumps, motion) in enumerate(
-            zip(self.full.contacts, self._felt(which)[1], obstacles, strict=True)
+            zip(self.full.contacts, self._evaluate(modes)[1], obstacles, strict=True)
         ):
             touches = contact.values.opening <= FLAT * scales.size_at_points(number)
             weights = np.where(contact.paired & touches, contact.measure, 0.0)
-            way = motion.of_points(contact.own_displacement())
+            displacement = motion.of_points(contact.own_displacement())
             gram += np.einsum("mqd,q,nqd->mn", jumps, weights, jumps)
-            work += np.einsum("mqd,q,qd->m", jumps, weights, way)
+            work += np.einsum("mqd,q,qd->m", jumps, weights, displacement)
         comm = self.full.unknowns.comm
         gram, work = global_sum(comm, gram), global_sum(comm, work)
-        return broadcast_from_root(comm, np.linalg.lstsq(gram, work, rcond=_SHARED)[0])
+        return broadcast_from_root(comm, np.linalg.lstsq(gram, work, rcond=_RANK_TOLERANCE)[0])
 
     @contextlib.contextmanager
     def _obstacles_at_start(self) -> Iterator[list[ObstacleMotion]]:
-        """Evaluate contacts with rigid obstacles where they were at the last commit. Collective.
+        """Place rigid obstacles where they were at the last commit. Collective.
 
         Yields:
-            Motion in the increment of the obstacle of every contact.
+            Motion of the obstacle of every contact in the increment.
         """
         self.full.evaluate_at(self.before)
         contacts = self.full.contacts
@@ -202,191 +199,191 @@ class InitialPositioning:
                 back.enter_context(contact.contact_kinematics.displaced(motion))
             yield motions
 
-    def _find_rest_position(self, which: Index) -> bool:
-        """Move bodies from here to where they rest, or to first touch. Collective.
+    def _find_rest_position(self, modes: Index) -> bool:
+        """Move bodies to a rest position, or to first touch. Collective.
 
         Args:
-            which: Numbers of their free motions.
+            modes: Indices of their free modes.
 
         Returns:
-            Whether there is such a place.
+            Whether there is such a position.
         """
-        here = self.full.state()
-        for along in (_ALONG, np.inf):
-            if self._lands(which, along):
+        start = self.full.state()
+        for fraction in (_MAX_TANGENTIAL_FRACTION, np.inf):
+            if self._move_to_rest(modes, fraction):
                 return True
-            self.full.evaluate_at(here)
-        free = self._free(which)
-        way = None if free is None else self._to_first_touch(free)
-        if way is not None:
-            self._move(which, way)
-        return way is not None
+            self.full.evaluate_at(start)
+        free = self._find_free_modes(modes)
+        motion = None if free is None else self._compute_first_touch(free)
+        if motion is not None:
+            self._displace(modes, motion)
+        return motion is not None
 
-    def _felt(self, which: Index) -> tuple[Array, list[Array]]:
-        """The free motions of these numbers at this rank's unknowns, and at points. Collective.
+    def _evaluate(self, modes: Index) -> tuple[Array, list[Array]]:
+        """Evaluate free modes at local unknowns and at the points of the contacts. Collective.
 
         Returns:
             (n_free, n_local), and for every contact (n_free, n_points, gdim).
         """
         fields, at_points = self.motions.present(self.full.operators)
-        return fields[which], [jumps[which] for jumps in at_points]
+        return fields[modes], [jumps[modes] for jumps in at_points]
 
-    def _free(self, which: Index) -> _Free | None:
-        """The free motions of these numbers; None: the load drives none. Collective."""
+    def _find_free_modes(self, modes: Index) -> _FreeModes | None:
+        """Evaluate the free modes; None if they are unloaded. Collective."""
         comm = self.full.unknowns.comm
-        fields, jumps = self._felt(which)
-        drive = global_sum(comm, fields @ self.load)
-        most = np.abs(drive).max()
-        mass = global_sum(comm, fields @ fields.T)
-        opposites = [contact.contact_kinematics for contact in self.full.contacts]
-        jumps = [o.displaced_directions(j) for o, j in zip(opposites, jumps, strict=True)]
-        return _Free(which, drive / most, mass, jumps) if most > 0 else None
+        fields, jumps = self._evaluate(modes)
+        load = global_sum(comm, fields @ self.load)
+        largest = np.abs(load).max()
+        gram = global_sum(comm, fields @ fields.T)
+        kinematics = [contact.contact_kinematics for contact in self.full.contacts]
+        jumps = [o.displaced_directions(j) for o, j in zip(kinematics, jumps, strict=True)]
+        return _FreeModes(modes, load / largest, gram, jumps) if largest > 0 else None
 
-    def _move(self, which: Index, coefficients: Array) -> None:
-        """Let free motions of these numbers go on from here, by their coefficients. Collective."""
+    def _displace(self, modes: Index, coefficients: Array) -> None:
+        """Displace bodies by free modes with these coefficients. Collective."""
         full, motions = self.full, self.motions
-        every = np.zeros(len(motions.free))
-        every[which] = coefficients
-        way = motions.displacement(every)
-        full.evaluate_at(full.state() + np.where(full.constrained, 0.0, way))
+        all_coefficients = np.zeros(len(motions.free))
+        all_coefficients[modes] = coefficients
+        displacement = motions.displacement(all_coefficients)
+        full.evaluate_at(full.state() + np.where(full.constrained, 0.0, displacement))
 
-    def _to_first_touch(self, free: _Free) -> Array | None:
-        """The way by which the load leads to first touch; None: it meets nothing. Collective."""
+    def _compute_first_touch(self, free: _FreeModes) -> Array | None:
+        """Compute the motion to first touch in the direction of the load, if any. Collective."""
         comm = self.full.unknowns.comm
-        coefficients = broadcast_from_root(comm, np.linalg.solve(free.mass, free.drive))
+        coefficients = broadcast_from_root(comm, np.linalg.solve(free.gram, free.load))
         coefficients /= np.abs(coefficients).max()
-        way = np.inf
+        distance = np.inf
         for contact, jumps in zip(self.full.contacts, free.jumps, strict=True):
             values = contact.values
             jump = np.tensordot(coefficients, jumps, axes=1)
             closing = np.einsum("qd,qd->q", jump, values.normal)
-            nearing = closing > NEGLIGIBLE
-            ways = values.opening[nearing] / closing[nearing]
-            way = min(way, global_min(comm, ways, empty=np.inf))
-        return None if way == np.inf else way * coefficients
+            closes = closing > NEGLIGIBLE
+            distances = values.opening[closes] / closing[closes]
+            distance = min(distance, global_min(comm, distances, empty=np.inf))
+        return None if distance == np.inf else distance * coefficients
 
-    # ---- to where a body rests -------------------------------------------------------------------
+    # ---- rest position ---------------------------------------------------------------------------
 
-    def _lands(self, which: Index, along: float) -> bool:
-        """Move rigid bodies to where they come to rest, if they do. Collective.
-
-        One set down on an edge has to be turned: the load does not lead there.
+    def _move_to_rest(self, modes: Index, fraction: float) -> bool:
+        """Move rigid bodies to a rest position; return whether there is one. Collective.
 
         Args:
-            which: Numbers of their free motions.
-            along: The largest share of a motion that may go along a Γc that grips.
+            modes: Indices of their free modes.
+            fraction: Largest tangential fraction of a mode on Γc with friction.
         """
         full, comm = self.full, self.full.unknowns.comm
-        free = self._free(which)
+        free = self._find_free_modes(modes)
         if free is None:
             return False
         gaps = [
-            np.abs(c.values.gap[c.paired & _feeling(jumps)]).max(initial=0.0)
+            np.abs(c.values.gap[c.paired & _find_displaced(jumps)]).max(initial=0.0)
             for c, jumps in zip(full.contacts, free.jumps, strict=True)
         ]
-        far = global_max(comm, np.array(gaps))
-        if not 0 < far < np.inf:
+        scale = global_max(comm, np.array(gaps))
+        if not 0 < scale < np.inf:
             return False
         linear = full.bulk.linear and not any(contact.finite for contact in full.contacts)
-        turn = np.inf if linear else _TURN
-        for _ in range(_STEPS):
-            free = self._free(which)
-            landed = None if free is None else self._landed(free, far, turn, along)
-            if landed is None or free is None:
+        max_angle = np.inf if linear else _FIRST_ANGLE
+        for _ in range(_MAX_STEPS):
+            free = self._find_free_modes(modes)
+            motion = None if free is None else self._compute_rest(free, scale, max_angle, fraction)
+            if motion is None or free is None:
                 return False
-            self._move(which, landed)
-            ways = [np.tensordot(landed, jumps, axes=1) for jumps in free.jumps]
-            farthest = np.array([np.abs(way).max(initial=0.0) for way in ways])
-            if linear or global_max(comm, farthest) <= _LAST * far:
+            self._displace(modes, motion)
+            steps = [np.tensordot(motion, jumps, axes=1) for jumps in free.jumps]
+            lengths = np.array([np.abs(step).max(initial=0.0) for step in steps])
+            if linear or global_max(comm, lengths) <= _LAST_STEP_RATIO * scale:
                 return True
-            turn /= 2
+            max_angle /= 2
         return False
 
-    def _landed(self, free: _Free, far: float, turn: float, along: float) -> Array | None:
-        """Where bodies come to rest. Collective.
+    def _compute_rest(
+        self, free: _FreeModes, scale: float, max_angle: float, fraction: float
+    ) -> Array | None:
+        """Compute the rest position for linearised gaps. Collective.
 
-        The load does there all the work that gaps allow, with small rotations: a linear programme.
+        It maximises the work of the load subject to the gaps: a linear programme.
 
         Args:
-            free: The free motions.
-            far: The largest gap (length).
-            turn: The largest angle (radians).
-            along: As in `_lands`.
+            free: The free modes.
+            scale: The largest gap (length).
+            max_angle: The largest angle (radians).
+            fraction: Largest tangential fraction of a mode on Γc with friction.
 
         Returns:
-            Coefficients of the free motions; None: such motions are none, are little of what the
-            load drives, as those in a corner are, or do not end.
+            Coefficients of the free modes; None: no mode is admissible, they have little of the
+            work of the load, as in a corner, or are unbounded.
         """
-        motions, comm, drive = self.motions, self.full.unknowns.comm, free.drive
-        grams: Array = np.zeros((2, len(drive), len(drive)))
+        motions, comm, load = self.motions, self.full.unknowns.comm, free.load
+        grams: Array = np.zeros((2, len(load), len(load)))
         rows = []
         for contact, jumps in zip(self.full.contacts, free.jumps, strict=True):
             values, weights = contact.values, contact.quadrature.weights
             closing = np.einsum("mqd,qd->qm", jumps, values.normal)
-            rubs = tangential_gram(contact, jumps, closed_only=False)
-            grams += [rubs, (closing.T * weights) @ closing]
-            there = contact.paired & _feeling(jumps)
-            rows.append(np.column_stack([closing, values.gap])[there])
-        rubs, presses = global_sum(comm, grams)
-        felt = rubs + presses
-        if not np.trace(felt) > 0:
+            tangential = tangential_gram(contact, jumps, closed_only=False)
+            grams += [tangential, (closing.T * weights) @ closing]
+            touchable = contact.paired & _find_displaced(jumps)
+            rows.append(np.column_stack([closing, values.gap])[touchable])
+        tangential, normal = global_sum(comm, grams)
+        total = tangential + normal
+        if not np.trace(total) > 0:
             return None
-        # There are motions that nothing feels.
-        felt += NEGLIGIBLE * np.trace(felt) * np.eye(len(felt))
-        shares, vectors = scipy.linalg.eigh(rubs, felt)
-        ways = broadcast_from_root(comm, vectors[:, shares < along])
+        # Some modes displace no point.
+        total += NEGLIGIBLE * np.trace(total) * np.eye(len(total))
+        fractions, vectors = scipy.linalg.eigh(tangential, total)
+        basis = broadcast_from_root(comm, vectors[:, fractions < fraction])
         limits = gather_rows(comm, np.concatenate(rows))
-        # What closes no gap, as to go along a corner, round-off of the load would take to no end.
-        _, closes, kept = np.linalg.svd(limits[:, :-1] @ ways, full_matrices=False)
-        ways = broadcast_from_root(
-            comm, ways @ kept[closes > NEGLIGIBLE * closes.max(initial=0.0)].T
-        )
-        work = drive @ ways
+        # Without modes that close no gap, along which round-off of the load would be unbounded.
+        _, sigma, vt = np.linalg.svd(limits[:, :-1] @ basis, full_matrices=False)
+        basis = broadcast_from_root(comm, basis @ vt[sigma > NEGLIGIBLE * sigma.max(initial=0.0)].T)
+        work = load @ basis
         if not len(work):
             return None
-        led = work @ np.linalg.solve(ways.T @ free.mass @ ways, work)
-        if not led > _MOST * (drive @ np.linalg.solve(free.mass, drive)):
+        admissible = work @ np.linalg.solve(basis.T @ free.gram @ basis, work)
+        if not admissible > _MIN_WORK_RATIO * (load @ np.linalg.solve(free.gram, load)):
             return None
-        # By ten times the tolerance of the linear programme no point that bears is left open.
-        gaps = limits[:, -1] / far + NEGLIGIBLE
-        bounds, most = [limits[:, :-1] @ ways], []
-        turning = motions.turns > 0
-        if turn < np.inf and turning.any():
-            turns = motions.free[free.which][:, turning] / motions.turns[turning]
-            angles = turns.T @ ways
+        # Points with a contact force remain closed by ten times the tolerance of the programme.
+        gaps = limits[:, -1] / scale + NEGLIGIBLE
+        bounds, angle_ends = [limits[:, :-1] @ basis], []
+        has_rotation = motions.turns > 0
+        if max_angle < np.inf and has_rotation.any():
+            rotations = motions.free[free.modes][:, has_rotation] / motions.turns[has_rotation]
+            angles = rotations.T @ basis
             bounds += [angles, -angles]
-            most += [np.full(2 * len(angles), turn / far)]
-        matrix, ends = np.concatenate(bounds), np.concatenate(most) if most else np.zeros(0)
-        # What was let go, obstacles may have moved into: it goes out, or no deeper where it cannot.
-        for deep in (gaps, np.maximum(gaps, NEGLIGIBLE)):
-            limit = np.concatenate([deep, ends])
-            found = broadcast_from_root(comm, _maximise(work, matrix, limit))
-            if found is not None or gaps.min() >= 0:
+            angle_ends += [np.full(2 * len(angles), max_angle / scale)]
+        matrix, angle_limits = (
+            np.concatenate(bounds),
+            np.concatenate(angle_ends) if angle_ends else np.zeros(0),
+        )
+        # Obstacles may have moved into released bodies: remove penetration, or do not increase it.
+        for normal_limit in (gaps, np.maximum(gaps, NEGLIGIBLE)):
+            limit = np.concatenate([normal_limit, angle_limits])
+            optimum = broadcast_from_root(comm, _maximise(work, matrix, limit))
+            if optimum is not None or gaps.min() >= 0:
                 break
-        if found is None:
+        if optimum is None:
             return None
-        # Many motions may do the same work: what no load leads anywhere, though gaps would let it
-        # go, moves least. All of them leave those limits where they are that bear the load, here to
-        # a tenth of what bodies are set down deeper than to touch.
-        place, bearing = found[0], found[1] > 0.0
-        both = np.concatenate([matrix, -matrix[bearing]])
-        limit = np.concatenate([limit, 0.1 * NEGLIGIBLE - limit[bearing]])
-        mass = ways.T @ free.mass @ ways
-        least = broadcast_from_root(comm, minimise_norm(mass, np.zeros(len(work)), both, limit))
-        return far * (ways @ (place if least is None else least))
+        # The maximum may not be unique: choose the least motion with the same active constraints,
+        # up to a tenth of the initial penetration.
+        solution, active = optimum[0], optimum[1] > 0.0
+        sides = np.concatenate([matrix, -matrix[active]])
+        limit = np.concatenate([limit, 0.1 * NEGLIGIBLE - limit[active]])
+        gram = basis.T @ free.gram @ basis
+        least = broadcast_from_root(comm, minimise_norm(gram, np.zeros(len(work)), sides, limit))
+        return scale * (basis @ (solution if least is None else least))
 
 
 def _maximise(work: Array, matrix: Array, limit: Array) -> tuple[Array, Array] | None:
-    """Maximise work @ x where matrix @ x <= limit.
+    """Maximise work @ x subject to matrix @ x <= limit.
 
     Returns:
-        That x, and the multipliers of the rows; None: there is no such x, or no most.
+        x and the multipliers of the rows; None: infeasible or unbounded.
     """
-    found = scipy.optimize.linprog(
+    result = scipy.optimize.linprog(
         -work,
         A_ub=matrix,
         b_ub=limit,
         bounds=(None, None),
         options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
     )
-    return (found.x, -found.ineqlin.marginals) if found.status == 0 else None
+    return (result.x, -result.ineqlin.marginals) if result.status == 0 else None
