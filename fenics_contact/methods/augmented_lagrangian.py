@@ -15,13 +15,13 @@ from fenics_contact.parallel import global_sum
 from fenics_contact.systems.multiplier_projection import project_multiplier_updates
 from fenics_contact.types import Array
 
-__all__ = ["RESIDUAL_ERROR_RATIO", "solve_augmented_lagrangian"]
+__all__ = ["RESIDUAL_RATIO", "solve_augmented_lagrangian"]
 
 logger = logging.getLogger("fenics_contact")
 
 _MAX_AUGMENTATIONS = 80
 # Relative residual of the first solution, and ratio of that of the next to the enforcement error.
-_FIRST_RTOL, RESIDUAL_ERROR_RATIO = 1e-4, 1e-2
+_FIRST_RTOL, RESIDUAL_RATIO = 1e-4, 1e-2
 # Enforcement error by its tolerance below which the next solution has the full accuracy.
 _NEARLY_CONVERGED_RATIO = 10.0
 # An overload is final if tractions may still grow by less than this fraction of the missing
@@ -87,9 +87,7 @@ def solve_augmented_lagrangian(
                 break
             exact = worst <= _NEARLY_CONVERGED_RATIO
             least = min((e for e in errors if e > 0), default=0.0)
-            equations.augmentation_rtol = (
-                0.0 if exact else min(_FIRST_RTOL, RESIDUAL_ERROR_RATIO * least)
-            )
+            equations.augmentation_rtol = 0.0 if exact else min(_FIRST_RTOL, RESIDUAL_RATIO * least)
             if number < _MAX_AUGMENTATIONS and worst > correction:
                 acceleration.augment()
                 if overload:  # the overload may have moved bodies too far away

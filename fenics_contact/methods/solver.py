@@ -1,4 +1,4 @@
-"""The solution of one increment: system, start, method, and what follows where that fails."""
+"""Solution of one increment: choice of system, linear solver and methods, and the fallbacks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from fenics_contact.contact.accuracy import Accuracy
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.methods.attempt import Attempt
-from fenics_contact.methods.augmented_lagrangian import RESIDUAL_ERROR_RATIO, solve_augmented_lagrangian
+from fenics_contact.methods.augmented_lagrangian import RESIDUAL_RATIO, solve_augmented_lagrangian
 from fenics_contact.methods.continuation import Continuation
 from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.linearised_solve import linearised_solver, solve_response
@@ -50,11 +50,10 @@ __all__ = ["METHODS", "Settings", "Solver"]
 
 logger = logging.getLogger("fenics_contact")
 
-# Increments expected where nothing is said.
-_EXPECTED = 4
+_DEFAULT_EXPECTED_INCREMENTS = 4
 
-# Others want bounds, a hierarchy or a partition of the unknowns, and end the program without them,
-# or solve one linear system. The first ones factor the consistent tangent.
+# Other SNES types need bounds, a hierarchy or a partition of the unknowns, without which they abort
+# the program, or solve one linear system. The Newton types factor the consistent tangent.
 _NEWTONS = ("newtonls", "newtontr", "newtontrdc")
 _SNES_TYPES = (*_NEWTONS, "qn", "nrichardson", "ngmres", "ncg", "anderson")
 _REASONS = PETSc.SNES.ConvergedReason
@@ -69,22 +68,21 @@ _COMMON: dict[str, Any] = {
     "snes_rtol": 1e-9,
     "snes_stol": 0.0,
     "snes_max_it": 1000,
-    # The paper's line search: |ρ·Ψ(ΔU + sρ)| ≤ c_L |ρ·Ψ(ΔU)|. With the single secant step that is
-    # `cp`'s default it takes three times the iterations, and fails at stiffness it can solve.
+    # The paper's line search: |ρ·Ψ(ΔU + sρ)| ≤ c_L |ρ·Ψ(ΔU)|. The default of `cp`, one secant step,
+    # takes three times the iterations, and fails at lower stiffness.
     "snes_linesearch_type": "cp",
     "snes_linesearch_rtol": 0.1,
     "snes_linesearch_max_it": 20,
-    # Bodies without contact are led to it before: no step of the iteration needs to be long.
+    # After initial positioning no step needs to be long.
     compat.LONGEST_STEP: 100.0,
-    # `cp` takes |F·y| below this for convergence of the whole; the residual itself is tested here.
+    # `cp` takes |F·y| below this for convergence of SNES; the residual itself is tested here.
     "snes_linesearch_atol": 1e-300,
 }
-# Without prefix: of the vectors. By default PETSc takes products with several of them by BLAS: with
-# PETSc 3.25 the last digits of L-BFGS changed so from a history to the same one again.
+# Vector options, without prefix. With products of several vectors by BLAS, the default of PETSc
+# 3.25, L-BFGS is not reproducible to the last digit.
 _VECTORS: dict[str, Any] = {"vec_mdot_use_gemv": False}
-# Options that only make sense for the sparse matrices over all unknowns.
-_NAMES_A_SOLVER = ("ksp_type", "pc_type", "pc_factor_mat_solver_type")
-# By name.
+# Options of a linear solver for the sparse matrices over all unknowns.
+_LINEAR_SOLVER_OPTIONS = ("ksp_type", "pc_type", "pc_factor_mat_solver_type")
 METHODS: dict[str, type[Method]] = {
     "lbfgs": QuasiNewton,
     "newton": Newton,
@@ -92,19 +90,18 @@ METHODS: dict[str, type[Method]] = {
     "primal_dual": PrimalDual,
     "continuation": Continuation,
 }
-# What takes over where a method fails: the first is for the stiffest friction, in few iterations,
-# the second for all else. The third solved none of 420 random scenes behind the others, but wedges
-# that are let go, and it finds overloads that no start shows: of a tight fit in the first round of
-# multipliers, whose springs are soft.
+# Methods after a failure: the first for very stiff friction, in few iterations, the second for
+# other problems. The third solved none of 420 random scenes after the others, but released wedges,
+# and finds overloads, as of a tight fit before the first augmentation.
 _FALLBACKS = ("primal_dual", "continuation", "alternating")
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the caller of `ContactProblem` says of the solution; see its arguments.
+    """Arguments of `ContactProblem` for the solution.
 
     Raises:
-        ValueError: One of them has no sense.
+        ValueError: An argument is invalid.
     """
 
     method: str | None
@@ -118,7 +115,7 @@ class Settings:
     accuracy: Accuracy | None
 
     def __post_init__(self) -> None:
-        """Refuse what has no sense."""
+        """Check the arguments."""
         if self.method not in (None, *METHODS):
             raise ValueError(f"method is {self.method!r}; use one of {sorted(METHODS)}")
         if self.linear_solver not in (None, *linear.KINDS):
@@ -126,9 +123,9 @@ class Settings:
                 f"linear_solver is {self.linear_solver!r}; use one of {sorted(linear.KINDS)}, or "
                 "None to choose by the size of the problem"
             )
-        for name, share in (("alpha", self.alpha), ("phi", self.phi)):
-            if not (is_number(share) and 0.0 <= share <= 1.0):
-                raise ValueError(f"{name} is {share!r}; it must be a number between 0 and 1")
+        for name, fraction in (("alpha", self.alpha), ("phi", self.phi)):
+            if not (is_number(fraction) and 0.0 <= fraction <= 1.0):
+                raise ValueError(f"{name} is {fraction!r}; it must be a number between 0 and 1")
         check_bool("fallback", self.fallback)
         if self.condensation is not None:
             check_bool("condensation", self.condensation)
@@ -137,41 +134,41 @@ class Settings:
 
 
 class Solver:
-    """Solves the equations of an increment by one method, and by others where that fails.
+    """Solver of the equations of an increment by one method, and by others after a failure.
 
     The constructor is collective.
 
     Args:
         full: The system on all unknowns.
-        motions: Rigid motions of the bodies.
-        settings: What the caller says.
+        motions: Rigid-body modes of the bodies.
+        settings: Arguments of the problem.
 
     Attributes:
         snes: The main SNES, with the user's options.
-        equations: What is solved.
-        options: PETSc options, present in the database only while they are read.
-        method: Name of the method tried first.
+        equations: The equations.
+        options: PETSc options, in the database only while they are read.
+        method: Name of the first method.
         main: The method on the main SNES.
-        condensed: Whether the unknowns that contact touches are iterated on alone.
-        expected: How many increments are expected.
+        condensed: Whether there is static condensation onto the retained unknowns.
+        expected_increments: Number of increments expected.
         methods: Further methods, by name.
-        predictor: Where the iteration starts from.
+        predictor: Predictor of the initial guess.
     """
 
     def __init__(self, full: FullSystem, motions: RigidBodyModes, settings: Settings) -> None:
         self.equations = Equations(full, motions, alpha=settings.alpha, phi=settings.phi)
-        self.expected_increments = _EXPECTED
+        self.expected_increments = _DEFAULT_EXPECTED_INCREMENTS
         self.predictor = Predictor(self.equations)
         self._full = full
-        # Which the caller may change later.
+        # A copy, as the caller may change the options.
         self._settings = replace(settings, petsc_options=dict(settings.petsc_options))
         self._comm = full.unknowns.comm
-        self._obstacle: str | None = None  # to condensation, as last said
-        self._pairings = self._present_pairings()  # those of the system
+        self._reason_not_to_condense: str | None = None  # last reason not to condense
+        self._pairings = self._present_pairings()  # of the system
         self._retained = RetainedDofs(full, unlimited=bool(settings.condensation))
-        # What is chosen and made by `_configure`, for the increments that are expected.
+        # Set by `_configure`, for the expected increments.
         self.options = Defaults()
-        self._named: list[str] = []  # options given that name a linear solver
+        self._named_solvers: list[str] = []  # given options of linear solvers
         self.condensed = False
         self.method = settings.method or "lbfgs"
         self.methods: dict[str, StandaloneMethod] = {}
@@ -182,7 +179,7 @@ class Solver:
 
     @property
     def system(self) -> System:
-        """The system that is iterated on."""
+        """The system that is solved."""
         return self.equations.system
 
     # ---- choices ---------------------------------------------------------------------------------
@@ -194,14 +191,14 @@ class Solver:
         options.set(_VECTORS, "")
         options.set_caller_options(settings.petsc_options, prefix)
         if settings.accuracy is not None:
-            # Residuals as large as what multipliers may miss would make rounds that change nothing.
+            # Multipliers do not converge with residuals of the size of their tolerance.
             augmented = [c for c in self._full.contacts if c.multipliers is not None]
-            least = [RESIDUAL_ERROR_RATIO * c.tolerance for c in augmented]
+            least = [RESIDUAL_RATIO * c.tolerance for c in augmented]
             options.set({"snes_rtol": min(settings.accuracy.rtol, *least, 1.0)}, prefix)
             if self._comm.rank == 0:
                 logger.info("accuracy %s", settings.accuracy)
-        solvers = [part + name for part in ("", "tangent_") for name in _NAMES_A_SOLVER]
-        self._named = [name for name in solvers if options.get(prefix + name) is not None]
+        solvers = [part + name for part in ("", "tangent_") for name in _LINEAR_SOLVER_OPTIONS]
+        self._named_solvers = [name for name in solvers if options.get(prefix + name) is not None]
         self.condensed = self._choose_condensation()
         self._full.linear_kind = self._choose_linear_solver()
         self._set_system()
@@ -209,7 +206,7 @@ class Solver:
         snes_type = options.get(prefix + "snes_type")
         main_options = self._main_options()
         if snes_type not in (None, main_options.get("snes_type")):
-            main_options |= _COMMON  # the line search is for the type of the method
+            main_options |= _COMMON  # the method's line search is for its own SNES type
         options.set(main_options, prefix)
         snes_type = options.get(prefix + "snes_type")
         if snes_type is not None and snes_type not in _SNES_TYPES:
@@ -228,9 +225,9 @@ class Solver:
         snes.setSolution(equations.solution)
         equations.solvers = {}
         for consistent in (False, True):
-            # Tolerances that follow the residual are for a solver that SNES has made.
-            own = consistent and not quasi_newton
-            ksp = snes.getKSP() if own else PETSc.KSP().create(self._comm)
+            # Tolerances that depend on the residual require a KSP created by SNES.
+            is_snes_solver = consistent and not quasi_newton
+            ksp = snes.getKSP() if is_snes_solver else PETSc.KSP().create(self._comm)
             part = prefix + ("tangent_" if consistent else "")
             ksp.setOptionsPrefix(part)
             symmetric = equations.is_symmetric(consistent)
@@ -239,7 +236,7 @@ class Solver:
             )
             options.set_from_options(ksp)
             equations.solvers[consistent] = ksp
-        this: Solver = weakref.proxy(self)  # SNES would keep what keeps it
+        this: Solver = weakref.proxy(self)  # without a reference cycle through SNES
         main = QuasiNewton if quasi_newton else Newton
         self.main = main(equations, snes, lambda: this.can_fall_back())
         self._forget_matrices()
@@ -248,7 +245,7 @@ class Solver:
         options.set_up(snes)
 
         def newton_solver(symmetric: bool) -> dict[str, Any]:
-            """Options of one for Newton's method; none where that of H₀ or the tangent is one."""
+            """Return options of a separate linear solver for Newton's method, if needed."""
             if not newton:
                 return {}
             return self.system.linear_solver(symmetric=symmetric, accurate=True) | newton
@@ -264,44 +261,41 @@ class Solver:
         equations.rtol = snes.getTolerances()[0]
 
     def expect(self, increments: int) -> None:
-        """Choose for a number of increments, before the first is solved. Collective.
-
-        SNES may be made anew, with the monitors that the one before had got.
-        """
+        """Configure for a number of increments, before the first is solved. Collective."""
         if self.expected_increments != increments:
             self.expected_increments = increments
             if self._choose_condensation() != self.condensed:
-                self._configure_anew()
+                self._reconfigure()
 
-    def _configure_anew(self) -> None:
-        """Make SNES anew, with the monitors that the one before had got. Collective."""
+    def _reconfigure(self) -> None:
+        """Create SNES again, with the monitors of the previous one. Collective."""
         monitors = self.snes.getMonitor() or ()
         self._configure()
         for monitor, arguments, keywords in monitors:
             self.snes.setMonitor(monitor, arguments, keywords)
 
     def _choose_condensation(self) -> bool:
-        """Whether to iterate on the unknowns that may be touched alone. Collective."""
-        obstacle = reason_not_to_condense(
+        """Return whether to use static condensation, and log a reason not to. Collective."""
+        reason = reason_not_to_condense(
             self._full,
             wanted=self._settings.condensation,
             linear_solver=self._settings.linear_solver,
-            named=self._named,
+            named=self._named_solvers,
             increments=self.expected_increments,
             n_retained=self._retained.count,
         )
-        if obstacle and obstacle != self._obstacle and self._comm.rank == 0:
-            logger.info("no static condensation: %s", obstacle)
-        self._obstacle = obstacle
-        return obstacle is None
+        if reason and reason != self._reason_not_to_condense and self._comm.rank == 0:
+            logger.info("no static condensation: %s", reason)
+        self._reason_not_to_condense = reason
+        return reason is None
 
     def _choose_method(self) -> str:
-        """Newton's method, or L-BFGS.
+        """Choose Newton's method, or L-BFGS.
 
-        L-BFGS is for linear bodies in space on all unknowns, where factors of a matrix cost dozens
-        of iterations, and it needs one in a round, not one in every iteration: a ball pressed on a
-        block, of 32,000 to a million unknowns, takes 1.2 to 1.7 linear solves by multigrid so, and
-        two plates under a bolt a fifth of the time of Newton's method.
+        L-BFGS is for linear bodies in space without condensation, where a factorisation costs
+        dozens of iterations: it needs one per restart, not per iteration. A ball pressed on a block
+        of 32,000 to a million unknowns takes 1.2 to 1.7 multigrid solutions, and two bolted plates
+        a fifth of the time of Newton's method.
         """
         full = self._full
         if self.condensed or not full.bulk.linear:
@@ -310,12 +304,12 @@ class Solver:
         return "lbfgs" if costly or full.linear_kind == "multigrid" else "newton"
 
     def _choose_linear_solver(self) -> str:
-        """How to solve systems over all unknowns, one of `linear.KINDS`. Collective."""
+        """Choose the linear solver for all unknowns, one of `linear.KINDS`. Collective."""
         kind, reason = linear_kind(
             self._full,
             wanted=self._settings.linear_solver,
             condensed=self.condensed,
-            named=self._named,
+            named=self._named_solvers,
             symmetric=self.equations.is_symmetric(False),
             tangent_symmetric=self.equations.is_symmetric(True),
         )
@@ -327,7 +321,7 @@ class Solver:
     # ---- the system ------------------------------------------------------------------------------
 
     def _set_system(self) -> None:
-        """Take the system to iterate on: all unknowns, or those to be retained. Collective."""
+        """Set the system to solve: all unknowns, or the retained ones. Collective."""
         system: System = self._full
         if self.condensed:
             selection = DofSubset(self._full.unknowns, self._retained.indices)
@@ -341,84 +335,81 @@ class Solver:
             self.equations.set_system(system)
 
     def _present_pairings(self) -> list[int]:
-        # Matrices of pairs that follow the bodies are made for each anew, and no one is retained.
+        # With finite kinematics the matrices are always assembled again.
         return [0 if c.contact_kinematics.follows else c.pairs.number for c in self._full.contacts]
 
     def is_current(self) -> bool:
-        """Whether bulk and pairs are those of the last solution. Collective."""
+        """Return whether bulk and pairs are those of the last solution. Collective."""
         return self._full.bulk.is_current() and self._present_pairings() == self._pairings
 
     def update_system(self, stiffness_changed: bool) -> None:
-        """Follow changes of the pairs and of the bulk's tangent. Collective."""
+        """Update the system after changes of the pairs and of the bulk's tangent. Collective."""
         if self._pairings != self._present_pairings():
             if not self.condensed or self._retained.extend():
                 self._set_system()
             self._pairings = self._present_pairings()
-            self._make_matrices()
+            self._reset_matrices()
         if stiffness_changed or not self.system.ready:
             self.equations.factorisations += self.system.update()
 
     # ---- the retained dofs -----------------------------------------------------------------------
 
     def select_dofs(self) -> bool:
-        """Whether an increment that starts here takes other unknowns; then `change`. Collective.
-
-        That is so where the first one starts, and where those that bear have other opposites.
-        """
+        """Return whether the increment needs other retained unknowns, by `change`. Collective."""
         others = self.condensed and self._pairings != self._present_pairings()
         return self._retained.select_dofs(other_pairs=others)
 
     def needs_more_dofs(self, *, found: bool) -> bool:
-        """Whether contact takes more unknowns than are retained: then `change`. Collective.
+        """Return whether contact acts on further unknowns, to be added by `change`. Collective.
 
         Args:
-            found: Whether there is a solution; if so contacts are evaluated on all of Γc.
+            found: Whether there is a solution, with contacts evaluated on all of Γc.
         """
         if not self.system.confined:
             return False
-        misses = self._retained.needs_more_dofs(self.system.operators, has_solution=found)
-        # A body that nothing else holds may find no rest on what is retained.
-        return misses or (not found and len(self.equations.motions.free) > 0)
+        required = self._retained.needs_more_dofs(self.system.operators, has_solution=found)
+        # Only the full system may have an equilibrium of a body that only contact constrains.
+        return required or (not found and len(self.equations.motions.free) > 0)
 
     def change(self, *, anew: bool) -> None:
-        """Keep other unknowns, or iterate on all where that is cheaper. Collective.
+        """Retain other unknowns, or solve the full system if that is cheaper. Collective.
 
-        The state is that in which the increment starts.
+        The state is that at the start of the increment.
 
         Args:
-            anew: Whether what is retained now may be dropped where all would be too much.
+            anew: Whether the retained unknowns may be dropped if there are too many.
         """
         self._retained.update(can_drop=anew)
         if self._choose_condensation() != self.condensed:
-            self._configure_anew()
+            self._reconfigure()
         elif self.condensed:
             self._set_system()
-            self._make_matrices()
+            self._reset_matrices()
 
     def keep(self, retained: Indices) -> None:
-        """Iterate on the unknowns that another run had retained, on all if it had. Collective."""
-        some = self._comm.allreduce(retained.size) > 0
-        anew = some != self.condensed and self._settings.condensation is None
-        if some and self.condensed:
+        """Retain the unknowns of another run, all if it had no condensation. Collective."""
+        is_condensed = self._comm.allreduce(retained.size) > 0
+        switch = is_condensed != self.condensed and self._settings.condensation is None
+        if is_condensed and self.condensed:
             self._retained.indices = retained
             self._set_system()
-        elif anew and not self._retained.is_all:
-            self._retained.indices = retained if some else self._retained.find_coupled()
-            self._configure_anew()
+        elif switch and not self._retained.is_all:
+            self._retained.indices = retained if is_condensed else self._retained.find_coupled()
+            self._reconfigure()
         self._retained.is_selected = True
 
     def restart(self) -> None:
-        """Drop what is retained from earlier increments. Collective."""
+        """Delete data of earlier increments. Collective."""
         self.system.forget()
-        self._make_matrices()
+        self._reset_matrices()
 
     def recover(self) -> None:
-        """Replace what an error of PETSc may have left locked or half done. Collective."""
+        """Replace vectors and matrices left locked or incomplete by a PETSc error. Collective."""
         self.equations.set_system(self.system)
-        self._make_matrices()
+        self._reset_matrices()
 
-    def _make_matrices(self) -> None:
-        """New matrices for new couplings, or to forget all that was factored. Collective."""
+    def _reset_matrices(self) -> None:
+        """Create the matrices again, without factorisations. Collective."""
         self.snes.reset()
         self._forget_matrices()
         self.main.attach(consistent=not isinstance(self.main, QuasiNewton))
@@ -438,52 +429,52 @@ class Solver:
         balance: bool = True,
         fallback: bool = True,
     ) -> tuple[int, list[Attempt], int]:
-        """Solve, let multipliers take over what the springs bear, and again. Collective.
+        """Solve the increment, with augmentations. Collective.
 
         Args:
-            cold: Whether nothing was borne before.
-            stiffness_changed: Whether the bulk's tangent is another one than in the last increment.
+            cold: Whether there was no contact force before.
+            stiffness_changed: Whether the bulk's tangent has changed since the last increment.
             load_before: External forces at this rank's unknowns in the committed state (force).
             balance: Whether to raise a ValueError for a load that contact cannot balance.
             fallback: Whether other methods may be tried after a failure.
 
         Returns:
-            Reason of the last solution, what was tried, and how many solutions there were.
+            Reason of the last solution, attempts, and number of solutions.
         """
         equations = self.equations
         equations.start = self.system.initial_forces()
         equations.is_round_off_known, equations.overload = False, None
         equations.generalised_loads = equations.motions.generalised_load(self._full.load)
 
-        def iterate(first_augmentation: bool) -> tuple[int, list[Attempt]]:
-            changed = first_augmentation and stiffness_changed
-            return self._iterate(first_augmentation, cold, changed, balance=balance, fallback=fallback)
+        def iterate(first: bool) -> tuple[int, list[Attempt]]:
+            changed = first and stiffness_changed
+            return self._iterate(first, cold, changed, balance=balance, fallback=fallback)
 
         return solve_augmented_lagrangian(equations, iterate, load_before)
 
     def _iterate(
         self,
-        first_augmentation: bool,
+        first: bool,
         cold: bool,
         stiffness_changed: bool,
         *,
         balance: bool,
         fallback: bool,
     ) -> tuple[int, list[Attempt]]:
-        """Iterate by one method after another from the same start. Collective.
+        """Solve by one method after another from the same initial guess. Collective.
 
         Returns:
-            Reason, and what was tried.
+            Reason and attempts.
         """
         equations = self.equations
         factored = self.predictor.factored
         equations.monitor.reset()
-        chosen = self.predictor.choose_initial_guess(first_augmentation=first_augmentation, cold=cold)
-        start: Array = np.divide(chosen, equations.length)
+        guess = self.predictor.choose_initial_guess(first_augmentation=first, cold=cold)
+        start: Array = np.divide(guess, equations.length)
         attempts: list[Attempt] = []
-        methods: Iterable[str] = self._chain(start, fallback=fallback, balance=balance)
+        methods: Iterable[str] = self._methods_to_try(start, fallback=fallback, balance=balance)
         if equations.overload is not None:
-            # All have failed, and only it can tell whether multipliers bear what springs did not.
+            # All have failed, and this method detects whether the overload persists.
             methods = ("alternating",)
         equations.overload = None
         for method in methods:
@@ -492,7 +483,7 @@ class Solver:
             if stiffness_changed:
                 equations.is_h0_current = False
             iterations, reason = self.methods.get(method, self.main).solve()
-            attempts.append(Attempt(method, iterations, self._outcome(reason)))
+            attempts.append(Attempt(method, iterations, self._describe_outcome(reason)))
             if reason > 0:
                 equations.overload = None
                 break
@@ -502,23 +493,23 @@ class Solver:
         own = self.methods.get(method)
         newton = self.snes.getType() in _NEWTONS if own is None else own.is_newton_solution
         newton = newton and not isinstance(self.main, QuasiNewton)
-        made = sum(attempt.iterations for attempt in attempts[-1:])
-        if reason > 0 and newton and (factored or made > 0):
-            # With a linear bulk a start by the tangent comes first even where it is far off, which
-            # a load that falls to nothing does not forgive after continuation.
+        n_iterations = sum(attempt.iterations for attempt in attempts[-1:])
+        if reason > 0 and newton and (factored or n_iterations > 0):
+            # With a linear bulk the step with this tangent is preferred even with a large residual,
+            # which fails after continuation if the load falls to zero.
             self.predictor.store_solution(predict=own is None or not self._full.bulk.linear)
         return int(reason), attempts
 
-    def _chain(self, start: Array, *, fallback: bool, balance: bool) -> Iterator[str]:
-        """The method, and those that follow while none converges. Collective.
+    def _methods_to_try(self, start: Array, *, fallback: bool, balance: bool) -> Iterator[str]:
+        """Yield the method and its fallbacks. Collective.
 
         Raises:
-            ValueError: Contact cannot balance the load on a nonlinear body (`check_balance`), which
-                may change as the body deforms: it is checked after a failure alone.
+            ValueError: Contact cannot balance the load on a nonlinear body (`check_balance`); only
+                checked after a failure, since the deformation may change it.
         """
         yield self.method
         if fallback and balance and not self._full.bulk.linear:
-            x = self.equations.solution.copy()  # which is judged if nothing follows
+            x = self.equations.solution.copy()  # the solution is verified if no method follows
             x.array[:] = start
             self.equations.set_state(x)
             x.destroy()
@@ -528,54 +519,59 @@ class Solver:
             others = (name for name in _FALLBACKS if name != self.method)
             yield from (name for name in others if self.methods[name].suits)
 
-    def _outcome(self, reason: int) -> str:
-        """What became of an attempt, in words. Collective."""
+    def _describe_outcome(self, reason: int) -> str:
+        """Describe the outcome of an attempt. Collective."""
         if reason > 0:
             return "converged"
         if (overload := self.equations.overload) is not None:
             return overload.in_words()
-        words = _OUTCOMES.get(reason, f"SNES reason {reason}")
-        return "; ".join(filter(None, (words, self.equations.monitor.describe_chattering())))
+        description = _OUTCOMES.get(reason, f"SNES reason {reason}")
+        return "; ".join(filter(None, (description, self.equations.monitor.describe_chattering())))
 
     def can_fall_back(self) -> bool:
-        """Whether to go on after a failure: not if iterations are rationed by the caller."""
+        """Return whether fallbacks may be tried: not if the caller limits the iterations."""
         return bool(
             self._settings.fallback and self.main.max_it >= self._main_options()["snes_max_it"]
         )
 
     def _main_options(self) -> dict[str, Any]:
-        """Those of the main SNES, where the caller says nothing."""
+        """Return default options of the main SNES."""
         return {**_COMMON, **METHODS[self.method].main_options()}
 
-    # ---- the neighbourhood of a solution ---------------------------------------------------------
+    # ---- linearised equations --------------------------------------------------------------------
 
     def linearised(
         self, springs: Sequence[Array], load: Array
     ) -> AbstractContextManager[Callable[[Sequence[Array] | None], Array]]:
-        """See `ContactProblem.linearised`, about a complete state under a load. Collective."""
+        """Linearise the equations at a complete state, for `ContactProblem.linearised`. Collective.
+
+        Args:
+            springs: Stiffness at the points of every contact.
+            load: External forces at this rank's unknowns (force).
+        """
         if self.select_dofs():
             self.change(anew=True)
-        # After a history that was taken up and is at its end nothing has been assembled yet.
+        # Nothing is assembled after a restart at the end of a history.
         self.update_system(self._full.update_stiffness())
-        self.predictor.invalidate_tangent()  # the matrix that is about to be used is another one
+        self.predictor.invalidate_tangent()
         self.system.begin(load)
         return linearised_solver(self.equations, springs)
 
     def end_without(self, acting: Sequence[tuple[Contact, Mask]], start: Array) -> Array | None:
-        """Where the increment would end, to first order, if some points did not act. Collective.
+        """Linearise the end of the increment with contacts restricted to some points. Collective.
 
         All other points that are closed in ``start`` stick.
 
         Args:
-            acting: Contacts, and which of their points do, (n_points,).
-            start: The state in which it starts, prescribed values as they were.
+            acting: Contacts and masks of their active points, (n_points,).
+            start: The state at the start of the increment, with the previous prescribed values.
 
         Returns:
-            The state; None if the other contacts do not hold the bodies, or contact forces are
+            The state; None if the other contacts do not constrain the bodies, or contact forces are
             not finite.
         """
         full, present = self._full, self._full.state()
-        moved = None
+        change = None
         with self.system.restricted_contacts():
             try:
                 for operator in self.system.operators:
@@ -583,8 +579,8 @@ class Solver:
                     for contact, points in acting:
                         if contact is operator.contact:
                             contact.restrict_to(points if within is None else points & within)
-                if not full.bulk.linear:  # a bulk that conditions have moved into may be inverted
-                    moved = present - start
+                if not full.bulk.linear:  # new prescribed values may invert cells
+                    change = present - start
                     full.set_state(start)
                     full.update_stiffness()
                 full.evaluate()
@@ -595,11 +591,11 @@ class Solver:
                 springs = [
                     c.values.springs(s, s) for c, s in zip(full.contacts, closed, strict=True)
                 ]
-                self.predictor.invalidate_tangent()  # the matrix that is about to be used is another one
-                with linearised_solver(self.equations, springs, prescribed=moved) as solve:
+                self.predictor.invalidate_tangent()
+                with linearised_solver(self.equations, springs, prescribed=change) as solve:
                     return present + solve(None)
             finally:
-                self.equations.valid_matrices.discard(True)  # it is that of another state
+                self.equations.valid_matrices.discard(True)
                 for contact, _ in acting:
                     contact.restrict_to()
                 full.set_state(present)
@@ -607,7 +603,7 @@ class Solver:
                     full.update_stiffness()
 
     def respond(self, springs: Sequence[Array], tractions: Sequence[Array]) -> list[Array]:
-        """`neighbourhood.respond`, by the matrix factored last. Collective."""
-        made = self.equations.valid_matrices
-        consistent = self.main.consistent or True in made or False not in made
+        """Compute changes of the jumps by tractions, with the last factored matrix. Collective."""
+        valid = self.equations.valid_matrices
+        consistent = self.main.consistent or True in valid or False not in valid
         return solve_response(self.equations, springs, tractions, consistent=consistent)

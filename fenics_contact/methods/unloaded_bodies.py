@@ -1,9 +1,8 @@
-"""Bodies that no force holds go no farther than others push them.
+"""Least motion of unloaded bodies.
 
-Where no force acts along a rigid-body mode at the start of an increment, nor at its end, every
-place is in equilibrium that no other body is in. A Newton step takes a body along by points that
-are closed without a force: with a body that pushed it and goes back, or anywhere. The increment
-ends in the place nearest to where it began instead: no force has moved the body farther.
+Along a rigid-body mode without force at the start and end of an increment every position without
+penetration is in equilibrium, and Newton's method may end in any. The solution is moved to the one
+nearest to the start of the increment.
 """
 
 from __future__ import annotations
@@ -19,20 +18,18 @@ from fenics_contact.types import Array
 
 __all__ = ["move_unloaded_bodies"]
 
-# Gaps are not linear in rigid motions where bodies turn, or are round: so many times they are taken
-# to be linear, anew where that has led.
-_LINEARISATIONS = 5
+_MAX_LINEARISATIONS = 5  # of the gaps with respect to rigid motions
 
 
 def move_unloaded_bodies(equations: Equations, part: Callable[[Array], Array]) -> bool:
-    """Move bodies without force to where they have moved least in the increment. Collective.
+    """Move unloaded bodies to the position of least motion in the increment. Collective.
 
-    Groups of coupled bodies are moved one after another, and left in the solution if the equations
-    do not hold where they are moved to. The contacts are evaluated at the end.
+    Groups of coupled bodies are moved in turn, and restored if the equations are not satisfied. The
+    contacts are evaluated at the end.
 
     Args:
-        equations: With a solution in ``u``, at which the contacts are evaluated.
-        part: Takes of all unknowns those that are up to date.
+        equations: The equations with a solution in ``u``, at which the contacts are evaluated.
+        part: Restrict a vector of all unknowns to those that are up to date.
 
     Returns:
         Whether any have moved.
@@ -43,45 +40,49 @@ def move_unloaded_bodies(equations: Equations, part: Callable[[Array], Array]) -
     committed = [contact.states.committed.points for contact in full.contacts]
     present = [contact.values for contact in full.contacts]
     modes = motions.find_unloaded(full.operators, [committed, present])
-    # Of a body with conditions that move it the least motion is not to stay where it is.
+    # Not bodies displaced by Dirichlet conditions.
     change = np.where(full.constrained, full.state() - equations.initial_unknowns, 0.0)
     modes = modes[~motions.move_any(modes, full.scales.largest(change) > 0.0)]
     groups = motions.groups()[np.argmax(np.abs(modes), axis=1)] if len(modes) else np.zeros(0)
-    moved = [_move(equations, part, modes[groups == n], int(n)) for n in np.unique(groups)]
-    return any(moved)
+    results = [
+        _minimise_motion(equations, part, modes[groups == n], int(n)) for n in np.unique(groups)
+    ]
+    return any(results)
 
 
-def _move(equations: Equations, part: Callable[[Array], Array], modes: Array, group: int) -> bool:
-    """Let some modes be as near to where the increment began as gaps permit. Collective.
+def _minimise_motion(
+    equations: Equations, part: Callable[[Array], Array], modes: Array, group: int
+) -> bool:
+    """Minimise the motion of the unloaded modes of one group subject to the gaps. Collective.
 
     Args:
-        equations: As in `move_unloaded_bodies`.
-        part: Likewise.
-        modes: Those of a group, in free motions, (n_modes, n_free).
-        group: Which group of coupled parts they move.
+        equations: The equations with a solution in ``u``.
+        part: Restrict a vector of all unknowns to those that are up to date.
+        modes: Unloaded modes of the group, in free motions, (n_modes, n_free).
+        group: The group of coupled bodies.
 
     Returns:
-        Whether the solution is there now.
+        Whether the solution has been moved.
     """
     full, motions, system = equations.full, equations.motions, equations.system
-    solution, moved = full.state(), False
-    least = ROUND_OFF * full.scales.size_of_groups[group]
-    acting = [motions.has_force(n, c, c.values) for n, c in enumerate(full.contacts)]
-    # Where a force acts these modes close no gap, but for round-off.
-    free = [~normal for normal, _ in acting]
-    for _ in range(_LINEARISATIONS):
-        since = motions.fit(full.state() - equations.initial_unknowns, part)
+    solution, has_moved = full.state(), False
+    tolerance = ROUND_OFF * full.scales.size_of_groups[group]
+    active = [motions.has_force(n, c, c.values) for n, c in enumerate(full.contacts)]
+    # At points with a force these modes close no gap, except for round-off.
+    free = [~normal for normal, _ in active]
+    for _ in range(_MAX_LINEARISATIONS):
+        motion = motions.fit(full.state() - equations.initial_unknowns, part)
         present = [contact.values for contact in full.contacts]
-        change = find_least_motion(full, motions, modes, present, since, free)
-        if change is None or np.abs(change).max() <= least:
+        change = find_least_motion(full, motions, modes, present, motion, free)
+        if change is None or np.abs(change).max() <= tolerance:
             break
-        way = motions.displacement(change)
-        full.evaluate_at(full.state() + np.where(full.constrained, 0.0, way))
-        moved = True
-    if not moved:
+        displacement = motions.displacement(change)
+        full.evaluate_at(full.state() + np.where(full.constrained, 0.0, displacement))
+        has_moved = True
+    if not has_moved:
         return False
     multipliers = []
-    for contact, points in zip(full.contacts, acting, strict=True):
+    for contact, points in zip(full.contacts, active, strict=True):
         if contact.multipliers is not None:
             multipliers.append((contact.multipliers, contact.multipliers.fields.rows()))
             contact.multipliers.drop(np.all(~points, axis=0))
