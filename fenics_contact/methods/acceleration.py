@@ -74,15 +74,8 @@ class Acceleration:
     def _combine(self, sequence: list[Array], weights: Array) -> Array:
         """Combine the last augmentations of one group. Collective.
 
-        The sequence restarts if the residual grows, as after changes of the active set.
-
-        Args:
-            sequence: λ and G(λ) of each, (2, n_points, n_columns) (stress); obsolete ones are
-                deleted.
-            weights: Weights of the residuals, (n_points, 1).
-
-        Returns:
-            The next multipliers, (n_points, n_columns) (stress).
+        The sequence restarts if the residual grows, as after changes of the active set; obsolete
+        entries are deleted. The next multipliers are (n_points, n_columns) (stress).
         """
         del sequence[: -1 - _DEPTH]
         old, new = np.swapaxes(sequence, 0, 1)

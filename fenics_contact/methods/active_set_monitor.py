@@ -44,11 +44,7 @@ class ActiveSetMonitor:
         self._status[:], self._changes[:], self._status_mask[:] = -1, 0, False
 
     def record(self, residual: float) -> None:
-        """Record the status of the evaluated contacts.
-
-        Args:
-            residual: Norm of the residual, equal on all ranks.
-        """
+        """Record the status of the evaluated contacts, at a residual equal on all ranks."""
         if not self._contacts:
             return
         if not self.initial_tractions:

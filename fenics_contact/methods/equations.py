@@ -53,8 +53,7 @@ class Equations:
         norms: Norms of the last `residual`.
         start: Forces at the beginning of the increment.
         initial_unknowns: State of `full` at the beginning of the increment.
-        is_round_off_known: Whether a matrix was assembled in this increment, which determines the
-            round-off of its residuals.
+        is_round_off_known: Whether the round-off of residuals is known, from an assembled matrix.
         rtol: Residual by the forces at which the solution has converged.
         augmentation_rtol: Tolerance of the solution before the next augmentation, if larger.
         solution: Dimensionless initial guess and, after a method, solution.
@@ -200,12 +199,7 @@ class Equations:
         self.is_h0_current = True
 
     def assemble(self, matrix: PETSc.Mat, contacts: Iterable[PETSc.Mat]) -> None:
-        """Assemble bulk tangent and contact matrices, with Dirichlet conditions. Collective.
-
-        Args:
-            matrix: The matrix, dimensionless.
-            contacts: Matrices of the contacts, destroyed.
-        """
+        """Assemble bulk tangent and contacts, whose matrices are destroyed. Collective."""
         filled = {c for c, m in self._matrices.items() if m.handle == matrix.handle}
         if True in filled:  # reset before the generator ``contacts`` may set them
             self.regularised_modes = np.zeros((0, 0))
@@ -231,9 +225,7 @@ class Equations:
     def evaluate(self, x: PETSc.Vec, *, trial: bool = False) -> None:
         """Evaluate bulk and contacts at ``x``, the point of the last residual. Collective.
 
-        Args:
-            x: The dimensionless state.
-            trial: Whether ``x`` is not an iterate, so that the monitor does not record it.
+        The monitor records iterates, but no ``trial`` points.
         """
         self.set_state(x)
         if not self._bulk.linear:
@@ -301,12 +293,7 @@ class Equations:
         return (operator.tangent() for operator in self.system.operators)
 
     def stiffnesses(self, *, everywhere: bool) -> Iterator[PETSc.Mat]:
-        """Yield αK_n + φK_t of the evaluated contacts.
-
-        Args:
-            everywhere: Whether all of Γc counts as sticking, as in the paper, if the active set is
-                unknown.
-        """
+        """Yield αK_n + φK_t of the evaluated contacts; ``everywhere``: all of Γc sticks."""
         for operator in self.system.operators:
             contact = operator.contact
             normal = tangential = np.ones(contact.quadrature.n_points)

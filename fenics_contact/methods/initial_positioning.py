@@ -132,9 +132,6 @@ class InitialPositioning:
         The slip reference is the rest position at the start of the increment, before prescribed
         displacements and obstacles change. From there bodies follow the obstacles on which they
         rest, and come to the rest position at the end of the increment.
-
-        Args:
-            modes: Indices of their free modes.
         """
         full = self.full
         initial = full.state()
@@ -158,15 +155,7 @@ class InitialPositioning:
             full.update_stiffness()
 
     def _fit_obstacle_motion(self, modes: Index, obstacles: Sequence[ObstacleMotion]) -> Array:
-        """Fit free modes to the motion of the touched obstacles by least squares. Collective.
-
-        Args:
-            modes: Indices of the free modes.
-            obstacles: Motion of the obstacle of every contact in the increment.
-
-        Returns:
-            Coefficients of the free modes.
-        """
+        """Fit free modes to the motion of the touched obstacles by least squares. Collective."""
         gram: Array = np.zeros((len(modes), len(modes)))
         work: Array = np.zeros(len(modes))
         scales = self.full.scales
@@ -184,11 +173,7 @@ class InitialPositioning:
 
     @contextlib.contextmanager
     def _obstacles_at_start(self) -> Iterator[list[ObstacleMotion]]:
-        """Place rigid obstacles where they were at the last commit. Collective.
-
-        Yields:
-            Motion of the obstacle of every contact in the increment.
-        """
+        """Reset rigid obstacles to the last commit; yield their motions since. Collective."""
         self.full.evaluate_at(self.before)
         contacts = self.full.contacts
         motions = [
@@ -200,14 +185,7 @@ class InitialPositioning:
             yield motions
 
     def _find_rest_position(self, modes: Index) -> bool:
-        """Move bodies to a rest position, or to first touch. Collective.
-
-        Args:
-            modes: Indices of their free modes.
-
-        Returns:
-            Whether there is such a position.
-        """
+        """Move bodies to a rest position, or to first touch; whether there is one. Collective."""
         start = self.full.state()
         for fraction in (_MAX_TANGENTIAL_FRACTION, np.inf):
             if self._move_to_rest(modes, fraction):
@@ -267,9 +245,7 @@ class InitialPositioning:
     def _move_to_rest(self, modes: Index, fraction: float) -> bool:
         """Move rigid bodies to a rest position; return whether there is one. Collective.
 
-        Args:
-            modes: Indices of their free modes.
-            fraction: Largest tangential fraction of a mode on Γc with friction.
+        ``fraction`` is the largest tangential fraction of a mode on Γc with friction.
         """
         full, comm = self.full, self.full.unknowns.comm
         free = self._find_free_modes(modes)

@@ -92,14 +92,7 @@ def find_overload(
 def _find_worst(
     motions: RigidBodyModes, operators: Sequence[ContactOperator], rows: Index, load: Array
 ) -> Overload | None:
-    """Find the largest overload of one group of coupled bodies. Collective.
-
-    Args:
-        motions: The rigid-body modes.
-        operators: Operators of evaluated contacts, over all unknowns.
-        rows: Indices of the free modes of the group, (n,).
-        load: Generalised load on all free modes (force).
-    """
+    """Find the largest overload along the free modes ``rows`` of coupled bodies. Collective."""
     comm, load = motions.comm, load[rows]
     size = np.abs(load).max(initial=0.0)
     if not size > 0:

@@ -126,9 +126,7 @@ def _describe(
 def _admissible_forces(operator: ContactOperator, modes: Array) -> Array:
     """Compute generalised forces of the admissible directions at local points, (n_rays, n_modes).
 
-    Args:
-        operator: Operator of the contact.
-        modes: The modes at its points, (n_modes, n_points, gdim).
+    The modes are given at the points, (n_modes, n_points, gdim).
     """
     contact, values = operator.contact, operator.contact.values
     normal, law = values.normal, contact.law
@@ -182,11 +180,8 @@ def unbalanced(rays: Array, resultant: Array) -> float:
 def _largest_forces(rays: Array, force: Array) -> Array:
     """Maximise each component of a force of the cone with the others prescribed, (n_free,).
 
-    Each has the sign of ``force``, or is NaN if the others cannot be reached.
-
-    Args:
-        rays: Rays of the cone, (n_free, n_rays), of unit length.
-        force: The prescribed force, (n_free,).
+    Each has the sign of ``force``, or is NaN if the others cannot be reached. The rays of the cone,
+    (n_free, n_rays), have unit length.
     """
     largest = np.full(len(force), np.nan)
     if not rays.size:

@@ -58,10 +58,9 @@ class Predictor:
         self._converged: list[_ConvergedContact] = []  # of the last solution
 
     def moved_from(self, before: Array) -> None:
-        """Store the change of the prescribed values, for a nonlinear bulk. Collective.
+        """Store the change of prescribed values since ``before``, of a nonlinear bulk. Collective.
 
-        Args:
-            before: The state of the full system at the end of the last increment.
+        ``before`` is the state of the full system at the end of the last increment.
         """
         full = self._equations.full
         self._prescribed_change = None
@@ -75,11 +74,7 @@ class Predictor:
         self.factored = self.predict = False
 
     def store_solution(self, *, predict: bool) -> None:
-        """Store the contacts of a solution whose tangent is factored. Collective.
-
-        Args:
-            predict: Whether a step with the tangent may be chosen.
-        """
+        """Store the contacts of a solution whose tangent is factored. Collective."""
         self.factored, self.predict = True, predict
         self.store_converged_contacts()
 
@@ -170,11 +165,6 @@ class Predictor:
         """Extrapolate the last increment to zero residual along its direction. Collective.
 
         The secant over the whole increment makes the result independent of its size.
-
-        Args:
-            present: The present state.
-            forces: The residual at the present state.
-            change: Change of the state of the full system in the last increment.
         """
         equations, system = self._equations, self._equations.system
         path = system.part(change).copy()
@@ -307,11 +297,6 @@ class Predictor:
 
         At a solution the regularisation nearly vanishes, and these components may be arbitrarily
         large. They become the least ones without penetration by the rest of the step.
-
-        Args:
-            system: The system.
-            present: The state before the step.
-            step: The step.
         """
         equations, full, motions = self._equations, self._equations.full, self._equations.motions
         modes = motions.in_free(equations.regularised_modes)

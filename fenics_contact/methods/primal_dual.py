@@ -182,12 +182,7 @@ class _Points:
         self.tangent: Array = np.zeros((*self._jump.shape, self._jump.shape[1]))
 
     def update(self, ratio: float, damping: float) -> None:
-        """Update the tractions by the step of the displacement; evaluate the law. Collective.
-
-        Args:
-            ratio: c / K.
-            damping: Damping of the step.
-        """
+        """Update the tractions by the damped step; evaluate the law with c / K. Collective."""
         self._ratio = ratio
         contact, springs = self._contact, self._springs
         jump = contact.contact_kinematics.present_jump()
@@ -202,11 +197,7 @@ class _Points:
         self.tangent = springs.remove_round_off(tangent, self._values)
 
     def linearise(self, *, everywhere: bool) -> None:
-        """Compute `traction` and `tangent` from the evaluated law.
-
-        Args:
-            everywhere: Whether all points count as sticking, as too few do to constrain the body.
-        """
+        """Compute `traction` and `tangent` from the law; ``everywhere``: all points stick."""
         springs, values, ratio = self._springs, self._values, self._ratio
         trial, excess = springs.trial_traction(values)
         if everywhere:

@@ -62,12 +62,7 @@ class RetainedDofs:
         return all_retained(self._full.unknowns.n_global, self._count(coupled), self._full.gdim)
 
     def _select_nearest(self, at_least: int = 0, gaps: Sequence[Array] | None = None) -> Indices:
-        """Select the unknowns of the points nearest to contact. Collective.
-
-        Args:
-            at_least: Approximate number, unless more are inexpensive.
-            gaps: Distances of points from contact; by default at the present state.
-        """
+        """Select about ``at_least`` unknowns of the points with the least gaps. Collective."""
         coupled = self.find_coupled()
         if self._is_small(coupled):
             return coupled
@@ -84,12 +79,7 @@ class RetainedDofs:
         )
 
     def _select_more(self, gaps: Sequence[Array] | None, *, can_drop: bool) -> Indices:
-        """Select more unknowns, including the present ones as long as it is worthwhile. Collective.
-
-        Args:
-            gaps: Distances of points from contact; by default at the present state.
-            can_drop: Whether the present ones may be dropped if there are too many.
-        """
+        """Select more unknowns, without the present ones if ``can_drop`` and needed. Collective."""
         present, n = self.indices, self.count
         retained = present
         for at_least in (_GROWTH_FACTOR * n, 0):

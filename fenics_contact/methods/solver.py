@@ -461,11 +461,7 @@ class Solver:
         balance: bool,
         fallback: bool,
     ) -> tuple[int, list[Attempt]]:
-        """Solve by one method after another from the same initial guess. Collective.
-
-        Returns:
-            Reason and attempts.
-        """
+        """Solve by one method after another; return reason and attempts. Collective."""
         equations = self.equations
         factored = self.predictor.factored
         equations.monitor.reset()
@@ -504,8 +500,7 @@ class Solver:
         """Yield the method and its fallbacks. Collective.
 
         Raises:
-            ValueError: Contact cannot balance the load on a nonlinear body (`check_balance`); only
-                checked after a failure, since the deformation may change it.
+            ValueError: Contact cannot balance the load, checked here for a nonlinear bulk.
         """
         yield self.method
         if fallback and balance and not self._full.bulk.linear:
@@ -543,12 +538,7 @@ class Solver:
     def linearised(
         self, springs: Sequence[Array], load: Array
     ) -> AbstractContextManager[Callable[[Sequence[Array] | None], Array]]:
-        """Linearise the equations at a complete state, for `ContactProblem.linearised`. Collective.
-
-        Args:
-            springs: Stiffness at the points of every contact.
-            load: External forces at this rank's unknowns (force).
-        """
+        """Linearise the equations at a complete state (`ContactProblem.linearised`). Collective."""
         if self.select_dofs():
             self.change(anew=True)
         # Nothing is assembled after a restart at the end of a history.

@@ -53,17 +53,7 @@ def move_unloaded_bodies(equations: Equations, part: Callable[[Array], Array]) -
 def _minimise_motion(
     equations: Equations, part: Callable[[Array], Array], modes: Array, group: int
 ) -> bool:
-    """Minimise the motion of the unloaded modes of one group subject to the gaps. Collective.
-
-    Args:
-        equations: The equations with a solution in ``u``.
-        part: Restrict a vector of all unknowns to those that are up to date.
-        modes: Unloaded modes of the group, in free motions, (n_modes, n_free).
-        group: The group of coupled bodies.
-
-    Returns:
-        Whether the solution has been moved.
-    """
+    """Minimise the motion along unloaded modes of a group; return whether it moved. Collective."""
     full, motions, system = equations.full, equations.motions, equations.system
     solution, has_moved = full.state(), False
     tolerance = ROUND_OFF * full.scales.size_of_groups[group]
