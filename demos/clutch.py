@@ -131,11 +131,11 @@ def solve(
 
     def with_all(vectors: np.ndarray, t: float) -> np.ndarray:
         """Turned as all of the scene is."""
-        return TURN_OF_ALL.turned(vectors, whole * (t + 1) / (until + 1))
+        return TURN_OF_ALL.rotate(vectors, whole * (t + 1) / (until + 1))
 
     def load(t: float) -> None:
         """Pressed until 0, then turned by so many degrees."""
-        lowered = TURN.turned(x, np.radians(max(t, 0))) - DEPTH * min(t + 1, 1) * SHAFT
+        lowered = TURN.rotate(x, np.radians(max(t, 0))) - DEPTH * min(t + 1, 1) * SHAFT
         for body, place in (("disc", x), ("ring", lowered)):
             plates[body][0].x.array[:] = (with_all(place, t) - x).ravel()
 

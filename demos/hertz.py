@@ -182,7 +182,7 @@ def solve(arguments: argparse.Namespace, friction: float) -> tuple[Scene, dict[s
     # Without friction the state does not depend on the way there: one increment.
     steps = arguments.increments or (80 if friction > 0 else 1)
     if arguments.accuracy is not None and not arguments.increments:
-        steps = scene.problem.increments_wanted
+        steps = scene.problem.default_increments
     words = f"μ = {friction:g}"
     history = fc.increments(
         scene.problem,

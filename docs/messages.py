@@ -21,7 +21,7 @@ HOLE = "…"
 _MOST = 4
 # Functions whose strings are parts of a verdict, and of what is told of an attempt.
 _VERDICT = {"failures", "hidden_by_round_off", "limit_point", "round_off_in_words"}
-_ATTEMPT = {"describe_chattering", "in_words"}
+_ATTEMPT = {"describe_chattering", "describe"}
 
 
 @dataclass(frozen=True)

@@ -16,19 +16,19 @@ from petsc4py import PETSc
 from fenics_contact.types import Array
 
 __all__ = [
-    "LONGEST_STEP",
-    "NOT_FINITE",
+    "DIVERGED_NOT_FINITE",
+    "MAX_STEP_OPTION",
     "cell_partitioner",
     "collapsed",
     "contains",
+    "create_csr_matrix",
     "create_facet_submesh",
     "entities_of",
     "geometry_dofmap",
     "geometry_element",
     "gmsh_data",
     "interpolation_points",
-    "option_was_read",
-    "sparse_matrix",
+    "is_option_used",
 ]
 
 if tuple(map(int, dolfinx.__version__.split(".")[:2])) < (0, 9):
@@ -41,10 +41,10 @@ if tuple(map(int, dolfinx.__version__.split(".")[:2])) < (0, 9):
 # SECANT, by which the release is recognised.
 _line_search_types = getattr(getattr(PETSc, "SNESLineSearch", None), "Type", None)
 _HAS_MAX_LAMBDA = hasattr(_line_search_types, "SECANT")
-LONGEST_STEP = "snes_linesearch_maxlambda" if _HAS_MAX_LAMBDA else "snes_linesearch_maxstep"
+MAX_STEP_OPTION = "snes_linesearch_maxlambda" if _HAS_MAX_LAMBDA else "snes_linesearch_maxstep"
 # SNES converged reason for a residual that is not finite, renamed in PETSc 3.25 (same number).
 _reasons = PETSc.SNES.ConvergedReason
-NOT_FINITE = int(
+DIVERGED_NOT_FINITE = int(
     _reasons.DIVERGED_FUNCTION_NANORINF
     if hasattr(_reasons, "DIVERGED_FUNCTION_NANORINF")
     else _reasons.DIVERGED_FNORM_NAN
@@ -81,7 +81,7 @@ def entities_of(tags: dolfinx.mesh.MeshTags, mesh: dolfinx.mesh.Mesh) -> bool:
     return getattr(of_tags, "_cpp_object", of_tags) is getattr(of_mesh, "_cpp_object", of_mesh)
 
 
-def option_was_read(name: str) -> bool:
+def is_option_used(name: str) -> bool:
     """Return whether an option (without dash) has been queried from PETSc's options database."""
     options = PETSc.Options()
     if hasattr(options, "used"):  # petsc4py >= 3.23
@@ -92,7 +92,7 @@ def option_was_read(name: str) -> bool:
     return bool(read.value)
 
 
-def sparse_matrix(
+def create_csr_matrix(
     comm: MPI.Comm, n_columns: int, pointers: Any, columns: Any, values: Array
 ) -> PETSc.Mat:
     """Create a sparse matrix from this rank's rows in CSR format, with global columns. Collective.

@@ -17,11 +17,11 @@ from mpi4py import MPI
 
 __all__ = [
     "CompileTimer",
-    "compile_by_rule",
+    "compile_by_quadrature_rule",
     "compile_expression",
     "compile_form",
-    "printed_as_ever",
-    "waiting",
+    "compile_timer",
+    "default_print_options",
 ]
 
 logger = logging.getLogger("fenics_contact")
@@ -36,11 +36,11 @@ def compile_form(form: ufl.Form, entity_maps: Any = None) -> fem.Form:
     """
     start = time.perf_counter()
     compiled = fem.form(form, entity_maps=entity_maps or None)
-    waiting.add(time.perf_counter() - start)
+    compile_timer.add(time.perf_counter() - start)
     return compiled
 
 
-def compile_by_rule(form: ufl.Form) -> list[fem.Form]:
+def compile_by_quadrature_rule(form: ufl.Form) -> list[fem.Form]:
     """Compile a UFL form as a sum of forms with one integral type and quadrature rule each.
 
     Collective. DOLFINx 0.9 silently drops one of two integrals with different quadrature rules over
@@ -58,11 +58,11 @@ def compile_expression(expression: Any, points: npt.NDArray[np.float64]) -> fem.
 
     FFCx derives its name from the printed points, which must not be rounded.
     """
-    with printed_as_ever():
+    with default_print_options():
         return fem.Expression(expression, points)
 
 
-def printed_as_ever() -> AbstractContextManager[Any]:
+def default_print_options() -> AbstractContextManager[Any]:
     """Restore NumPy's default print options, on which names in Basix and FFCx depend."""
     return np.printoptions(
         precision=8,
@@ -102,4 +102,4 @@ class CompileTimer:
             print(f"\r\x1b[K{text}", file=sys.stderr)  # overwrites a progress bar
 
 
-waiting = CompileTimer()
+compile_timer = CompileTimer()

@@ -81,7 +81,7 @@ def hidden_by_round_off(verdict: Verdict) -> list[str]:
     ]
 
 
-# First word of `Overload.in_words`.
+# First word of `Overload.describe`.
 _OVERLOAD = "overload:"
 _ADVICE_LAW = (
     "The equations hold, but the contact law does not: check that contact_traction, friction_bound "

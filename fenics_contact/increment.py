@@ -19,7 +19,7 @@ from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.first_touch import set_slip_reference_at_touch
 from fenics_contact.methods.initial_positioning import InitialPositioning
 from fenics_contact.methods.load_balance import check_balance, find_free_modes
-from fenics_contact.methods.opposite_points import OppositePoints
+from fenics_contact.methods.pair_iteration import PairIteration
 from fenics_contact.methods.solver import Solver
 from fenics_contact.methods.unloaded_bodies import move_unloaded_bodies
 from fenics_contact.parallel import global_max
@@ -54,7 +54,7 @@ class Increment:
     """
 
     recover_interior: bool
-    points: OppositePoints
+    points: PairIteration
     start_time: float = field(default_factory=time.perf_counter)
     attempts: list[Attempt] = field(default_factory=list)
 
@@ -131,12 +131,12 @@ class IncrementSolver:
             self._predict_opposite_points(points, state, load)
         before = self.full.state()
         self.full.prescribe()
-        solver.predictor.moved_from(before)
+        solver.predictor.store_prescribed_change(before)
         stiffness_changed = self.full.update_stiffness()
         if stiffness_changed and self.full.bulk.linear:
             self.modulus.measure()
         positioning = InitialPositioning(self.full, solver.equations.motions, load, before)
-        cold = positioning.lead(first=state.increment == 0)
+        cold = positioning.position_bodies(first=state.increment == 0)
         if solver.select_dofs():
             return Retry.UNKNOWNS
         solver.update_system(stiffness_changed)
@@ -144,7 +144,7 @@ class IncrementSolver:
         solver.system.begin(load)
         solver.equations.initial_unknowns = state.unknowns
         positioned = np.where(self.full.constrained, before, self.full.state())
-        end = set_slip_reference_at_touch(self.full, positioned, solver.end_without)
+        end = set_slip_reference_at_touch(self.full, positioned, solver.linearise_end)
         solver.predictor.change = state.change
         solver.predictor.expected = end if points.end is None else points.end
         with solver.system.restricted_contacts():
@@ -156,7 +156,7 @@ class IncrementSolver:
                 fallback=not points.predicted,
             )
         # Points outside of the retained dofs can only be verified with the interior displacement.
-        skips_recovery = not (increment.recover_interior or solver.system.confined)
+        skips_recovery = not (increment.recover_interior or solver.system.is_restricted)
         skips_recovery = skips_recovery and self._can_skip_recovery(state)
         interior = solver.system.pending_field if skips_recovery else None
         if not skips_recovery:
@@ -174,17 +174,17 @@ class IncrementSolver:
             return increment.set_outcome(Retry.FROM_COMMITTED)
         if solver.needs_more_dofs(found=reason > 0):
             return increment.set_outcome(Retry.UNKNOWNS)
-        if reason > 0 and (outdated := points.to_update()):
+        if reason > 0 and (outdated := points.find_outdated()):
             return self._choose_pairs(increment, outdated, interior)
         kinematics = reason > 0  # after a failure there may be no factors
         if skips_recovery:
             verdict, energies = self._verify_retained(state.unknowns, kinematics=kinematics)
         else:
-            assemble = increment.recover_interior or not solver.system.confined
+            assemble = increment.recover_interior or not solver.system.is_restricted
             verdict, energies = self._verify_all(
                 state.unknowns, kinematics=kinematics, assemble=assemble
             )
-        if reason > 0 and (outdated := points.to_update_for(verdict.pairing_errors)):
+        if reason > 0 and (outdated := points.find_outdated_for(verdict.pairing_errors)):
             return self._choose_pairs(increment, outdated, interior)
         energy = None
         if reason > 0 and not verdict.failures:
@@ -218,7 +218,7 @@ class IncrementSolver:
         )
         return trial, step
 
-    def _predict_opposite_points(self, points: OppositePoints, state: State, load: Array) -> None:
+    def _predict_opposite_points(self, points: PairIteration, state: State, load: Array) -> None:
         """Find opposite points at the extrapolated end of the increment. Collective."""
         before = self.full.state()
         points.predict(state, self.full.prescribed_values(), load)
@@ -233,7 +233,7 @@ class IncrementSolver:
         """Choose the states in which contacts find new pairs, with a complete u. Collective."""
         if interior is not None:
             self.solver.system.complete(interior)
-        increment.points.choose_states(contacts, self.full.state())
+        increment.points.relax_states(contacts, self.full.state())
         return increment.set_outcome(Retry.PAIRS)
 
     def _can_skip_recovery(self, state: State) -> bool:
@@ -250,7 +250,7 @@ class IncrementSolver:
                 return False
         # The positions of nodes that the quadrature points do not determine need a complete u.
         if not all(
-            c.contact_kinematics.sampler is None or c.facet_places.points_carry_nodes
+            c.contact_kinematics.sampler is None or c.facet_sampling.points_determine_nodes
             for c in contacts
         ):
             return False
@@ -274,9 +274,7 @@ class IncrementSolver:
 
     # ---- verification ----------------------------------------------------------------------------
 
-    def _compute_energy(
-        self, state: State, energies: EnergyState, points: OppositePoints
-    ) -> Energy:
+    def _compute_energy(self, state: State, energies: EnergyState, points: PairIteration) -> Energy:
         """Return the energies of the increment from a committed state. Collective."""
         start, coordinate_id = state.energy, self.solver.system.coordinate_id
         if self.full.coordinate_id not in energies.forces and coordinate_id not in start.forces:

@@ -19,13 +19,13 @@ __all__ = [
     "all_finite",
     "broadcast_from_root",
     "collective_errors",
-    "gather_on_first",
+    "gather_on_root",
     "gather_rows",
     "global_max",
     "global_mean",
     "global_min",
     "global_sum",
-    "longest",
+    "max_norm",
     "raise_collectively",
     "warn",
 ]
@@ -34,12 +34,12 @@ __all__ = [
 logger = logging.getLogger("fenics_contact")
 
 # Seconds that a failing rank waits for the others to fail, too, and the tag of their messages.
-PATIENCE = 30.0
+ABORT_TIMEOUT = 30.0
 _TAG = 7351
 
 
 def raise_collectively(comm: MPI.Comm, error: BaseException) -> None:
-    """Return if all ranks have failed; abort all ranks if they have not after `PATIENCE` seconds.
+    """Return if all ranks have failed; else abort all ranks after `ABORT_TIMEOUT` seconds.
 
     If a rank fails alone, the others wait for it in a collective call for ever (deadlock). Failing
     ranks notify each other by point-to-point messages, which do not match that call.
@@ -47,7 +47,7 @@ def raise_collectively(comm: MPI.Comm, error: BaseException) -> None:
     others = [rank for rank in range(comm.size) if rank != comm.rank]
     requests = [comm.Isend(b"", rank, _TAG) for rank in others]
     requests += [comm.Irecv(bytearray(1), rank, _TAG) for rank in others]
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + ABORT_TIMEOUT
     while not MPI.Request.Testall(requests):
         if time.monotonic() > deadline:
             logger.critical(
@@ -135,7 +135,7 @@ def global_mean(comm: MPI.Comm, vectors: Array) -> Array:
     return np.asarray(sums[:-1] / max(sums[-1], 1.0))
 
 
-def longest(comm: MPI.Comm, vectors: Array) -> float:
+def max_norm(comm: MPI.Comm, vectors: Array) -> float:
     """Return the largest Euclidean norm of rows (n, gdim), or magnitude of scalars (n,).
 
     Collective. The result is 0 without rows; NaN wins.
@@ -155,7 +155,7 @@ def gather_rows(comm: MPI.Comm, rows: Array) -> Array:
     return np.concatenate(comm.allgather(rows), axis=0)
 
 
-def gather_on_first(comm: MPI.Comm, *rows: npt.NDArray[Any]) -> list[npt.NDArray[Any]] | None:
+def gather_on_root(comm: MPI.Comm, *rows: npt.NDArray[Any]) -> list[npt.NDArray[Any]] | None:
     """Stack rows of all ranks, by rank, on the first one; return None on the others. Collective."""
     parts = comm.gather(rows)
     return None if parts is None else [np.concatenate(part) for part in zip(*parts, strict=True)]

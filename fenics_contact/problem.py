@@ -25,9 +25,9 @@ from fenics_contact.checks.verifier import Verifier
 from fenics_contact.contact.contact import Contact
 from fenics_contact.failure import NotConverged
 from fenics_contact.increment import Increment, IncrementSolver, Retry
-from fenics_contact.methods.callbacks import interrupts_held, release_interrupt
+from fenics_contact.methods.callbacks import defer_interrupts, release_interrupt
 from fenics_contact.methods.load_balance import find_free_modes
-from fenics_contact.methods.opposite_points import OppositePoints
+from fenics_contact.methods.pair_iteration import PairIteration
 from fenics_contact.methods.solver import Settings, Solver
 from fenics_contact.parallel import global_max, raise_collectively, warn
 from fenics_contact.state import State, Trial
@@ -165,7 +165,7 @@ class ContactProblem:
         self._prefix, self._comm = prefix, u.function_space.mesh.comm
         n_motions = sum(len(contact.motions) for contact in self.contacts)
         unknowns = Unknowns(u.function_space, n_motions)
-        constrained = find_constrained_unknowns(bcs, u, unknowns, mixed=self.displacement.mixed)
+        constrained = find_constrained_unknowns(bcs, u, unknowns, mixed=self.displacement.is_mixed)
         check_contacts(self.contacts, self.displacement, constrained)
         self.full = FullSystem(self.displacement, unknowns, bulk, self.contacts, constrained, bcs)
 
@@ -248,12 +248,12 @@ class ContactProblem:
                 f"expected_increments is {number!r}; it must be an integer, at least 1"
             )
         if self._is_first:
-            self.solver.expect(int(number))
+            self.solver.set_expected_increments(int(number))
 
     # ---- state and linearisation -----------------------------------------------------------------
 
     @property
-    def increments_wanted(self) -> int:
+    def default_increments(self) -> int:
         """Default number of increments of a load history, by `Accuracy`; 1 without one."""
         friction = any(c.law.has_friction for c in self.contacts)
         return self.accuracy.increments if self.accuracy and friction else 1
@@ -292,7 +292,7 @@ class ContactProblem:
 
     # ---- solving ---------------------------------------------------------------------------------
 
-    @interrupts_held()
+    @defer_interrupts()
     def solve(self, *, recover_interior: bool = True) -> Step:
         """Solve the next increment with the present loads and conditions. Collective.
 
@@ -314,7 +314,7 @@ class ContactProblem:
         """
         check_bool("recover_interior", recover_interior)
         updates_pairs = self.small_displacement_tolerance < np.inf
-        points = OppositePoints(self.full, self.contacts if updates_pairs else [])
+        points = PairIteration(self.full, self.contacts if updates_pairs else [])
         increment = Increment(recover_interior, points)
         self._check_committed()
         self._check_histories()
@@ -359,7 +359,7 @@ class ContactProblem:
                     # user's.
                     if result is Retry.UNKNOWNS:
                         count = sum(each.outcome == result.value for each in increment.attempts)
-                        self.solver.change(anew=count <= 1)
+                        self.solver.change_dofs(can_drop=count <= 1)
                 release_interrupt()
         except BaseException as error:
             raise_collectively(self._comm, error)
@@ -369,11 +369,11 @@ class ContactProblem:
             raise
         finally:
             if self._comm.rank == 0:
-                self.solver.options.warn_of_unread(self._prefix)
+                self.solver.options.warn_of_unused(self._prefix)
         self._trial, step = result
         return step
 
-    def _find_pairs(self, points: OppositePoints) -> None:
+    def _find_pairs(self, points: PairIteration) -> None:
         """Find the opposite points in the states chosen for them. Collective."""
         if any(state.interior is not None for state in (self._present, self.state)):
             # The search needs the interior, which cannot be recovered after a change of pairs.
@@ -474,7 +474,7 @@ class ContactProblem:
             self._trial = trial
             self._reset_to(unknowns)
 
-    @interrupts_held()
+    @defer_interrupts()
     def commit(self) -> None:
         """Make the solved state the start of the next increment, with its history. Collective.
 
@@ -568,7 +568,7 @@ class ContactProblem:
             yield
         finally:
             self.full.set_state(before)
-            modulus.put_back(measured)
+            modulus.restore(measured)
 
     def set_committed(
         self,
@@ -589,7 +589,7 @@ class ContactProblem:
         state, change, internal, external, load_change, retained, _ = rows
         increment, self.expected_increments, *anew = (int(number) for number in numbers)
         self._is_first, self._trial = False, None
-        self.solver.keep(np.flatnonzero(retained).astype(np.int32))
+        self.solver.retain_dofs(np.flatnonzero(retained).astype(np.int32))
         self.full.set_state(state)
         load = self.full.present_load()
         self.full.begin(load)

@@ -4,7 +4,7 @@ import numpy as np
 
 from fenics_contact.types import Array, Index
 
-__all__ = ["FLAT", "NEGLIGIBLE", "ROUND_OFF", "by_place"]
+__all__ = ["FLAT", "NEGLIGIBLE", "ROUND_OFF", "sort_by_coordinates"]
 
 # Sums and differences of forces, stiffness, work or weights, relative to the largest term.
 ROUND_OFF = 1e-12
@@ -15,7 +15,7 @@ NEGLIGIBLE = 1e-9
 FLAT = 1e-6
 
 
-def by_place(x: Array) -> Index:
+def sort_by_coordinates(x: Array) -> Index:
     """Return the lexicographic order of positions (n, d), up to round-off."""
     size = np.abs(x).max(initial=0.0) or 1.0
     return np.lexsort(np.round(x / (NEGLIGIBLE * size)).T[::-1])

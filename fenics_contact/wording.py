@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["percent", "place_in_words"]
+__all__ = ["format_point", "percent"]
 
 
 def percent(ratio: float) -> str:
@@ -13,7 +13,7 @@ def percent(ratio: float) -> str:
     return f"{100 * ratio:.2g} %" if abs(ratio) < 0.995 else f"{100 * ratio:.0f} %"
 
 
-def place_in_words(place: npt.ArrayLike) -> str:
+def format_point(place: npt.ArrayLike) -> str:
     """Return coordinates as a list, rounded to six digits of the largest one."""
     x = np.asarray(place, dtype=np.float64)
     largest = np.abs(x).max(initial=0.0)

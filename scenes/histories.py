@@ -168,7 +168,7 @@ def picture(made: History) -> dict[str, Array]:
 
 def _nodal(problem: fc.ContactProblem, field: fem.Function) -> Array:
     """Values of what is solved for, or a field like it, in an order of places."""
-    if not problem.displacement.mixed:
+    if not problem.displacement.is_mixed:
         return nodal(field)
     parts = range(field.function_space.num_sub_spaces)
     return np.concatenate([nodal(field.sub(i).collapse()).ravel() for i in parts])

@@ -74,8 +74,8 @@ def test_what_is_given_wins():
     assert len(made.run(steps=2)) == 2
     plain = press()
     assert float(plain.contact.parameters["k_n"].value) == DEFAULT_FACTOR
-    assert plain.problem.accuracy is None and plain.problem.increments_wanted == 1
-    assert press(fc.Frictionless(), accuracy="fine").problem.increments_wanted == 1
+    assert plain.problem.accuracy is None and plain.problem.default_increments == 1
+    assert press(fc.Frictionless(), accuracy="fine").problem.default_increments == 1
     given = press(accuracy="fine", tolerance=1e-3).contact
     assert given.tolerance == 1e-3 and given.multipliers is not None
 

@@ -12,7 +12,7 @@ from petsc4py import PETSc
 import fenics_contact as fc
 from fenics_contact.systems.candidate_dofs import touched
 from fenics_contact.systems.condensation import Condensation
-from fenics_contact.systems.condensed import worthwhile
+from fenics_contact.systems.condensed import is_worthwhile
 from fenics_contact.systems.unknowns import DofSubset
 from scenes.blocks import CELLS, GRID, LEFT, RIGHT, TOP, block, kirchhoff
 from scenes.comparing import (
@@ -373,12 +373,16 @@ def test_the_choice(caplog):
 
 def test_what_is_worth_it():
     """Small surfaces, and large ones of large bodies; not the whole of a body, nor gigabytes."""
-    assert worthwhile(50, 10, 2) and worthwhile(250_000, 1000, 2) and worthwhile(100_000, 1500, 3)
-    assert worthwhile(12_604, 736, 2) and not worthwhile(2000, 700, 2)
-    assert not worthwhile(10_000, 3000, 2)
-    assert not worthwhile(100_000, 6000, 3)
-    assert not worthwhile(10**8, 20_000, 3)
-    assert not worthwhile(1000, 0, 2)
+    assert (
+        is_worthwhile(50, 10, 2)
+        and is_worthwhile(250_000, 1000, 2)
+        and is_worthwhile(100_000, 1500, 3)
+    )
+    assert is_worthwhile(12_604, 736, 2) and not is_worthwhile(2000, 700, 2)
+    assert not is_worthwhile(10_000, 3000, 2)
+    assert not is_worthwhile(100_000, 6000, 3)
+    assert not is_worthwhile(10**8, 20_000, 3)
+    assert not is_worthwhile(1000, 0, 2)
 
 
 @pytest.mark.mpi

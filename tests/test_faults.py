@@ -260,7 +260,7 @@ def test_memory_refused(method, condensation, prefix):
 ALONE = """
 from scenes.rubbing import PATH, Rub
 from fenics_contact import parallel
-parallel.PATIENCE = 0.2
+parallel.ABORT_TIMEOUT = 0.2
 made = Rub()
 made.move(*PATH[0])
 name, rank = "{name}", made.problem.u.function_space.mesh.comm.rank

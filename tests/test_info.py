@@ -81,7 +81,7 @@ def test_what_a_first_run_waits_for_is_said_once(monkeypatch, caplog, capsys):
         caplog.clear()
         times = itertools.count(0.0, seconds)
         monkeypatch.setattr(compiling.time, "perf_counter", lambda: next(times))
-        monkeypatch.setattr(compiling, "waiting", compiling.CompileTimer())
+        monkeypatch.setattr(compiling, "compile_timer", compiling.CompileTimer())
         monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
         with caplog.at_level(level, "fenics_contact"):
             for _ in range(2):

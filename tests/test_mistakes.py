@@ -25,7 +25,7 @@ from scenes.stacks import LOWER, SIDES, UPPER, stack
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
-NOWHERE = 77
+MAX_COORDINATE = 77
 
 
 def bulk(scene, ds, tag):
@@ -115,23 +115,23 @@ def test_a_tag_of_nothing(pairs):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_measures(bulk(scene, ds, TOP), scene.mesh)
-    with pytest.warns(UserWarning, match=rf"over ds\({NOWHERE}\), but nothing"):
-        check_measures(bulk(scene, ds, NOWHERE), scene.mesh)
+    with pytest.warns(UserWarning, match=rf"over ds\({MAX_COORDINATE}\), but nothing"):
+        check_measures(bulk(scene, ds, MAX_COORDINATE), scene.mesh)
 
 
 def test_a_problem_with_a_tag_of_nothing():
     """It is told when the problem is made."""
     scene = pressed()
     ds = ufl.Measure("ds", scene.mesh, subdomain_data=scene.tags)
-    with pytest.warns(UserWarning, match=rf"over ds\({NOWHERE}\), but nothing"):
-        problem_of(scene, bulk(scene, ds, NOWHERE))
+    with pytest.warns(UserWarning, match=rf"over ds\({MAX_COORDINATE}\), but nothing"):
+        problem_of(scene, bulk(scene, ds, MAX_COORDINATE))
 
 
 def test_a_condition_on_nothing():
     """A tag that no facet has, with those that hold: it is told which."""
     scene = pressed()
     V = scene.u.function_space
-    dofs = fem.locate_dofs_topological(V, 1, scene.tags.find(NOWHERE))
+    dofs = fem.locate_dofs_topological(V, 1, scene.tags.find(MAX_COORDINATE))
     empty = fem.dirichletbc(fem.Function(V), dofs)
     bcs = [*scene.rollers(), empty]
     with pytest.warns(UserWarning, match=rf"bcs\[{len(bcs) - 1}\] has no effect"):

@@ -308,7 +308,7 @@ def test_the_stiffness_of_springs_follows_the_shear_modulus():
         scene = rubber("triangle", n=(4, 2), mixed="Taylor-Hood", nu=nu, E=1e3)
         problem, contact = scene.problem(disc(scene, 0.8), fc.Frictionless())
         k_n, h = contact.values.parameters["k_n"], 0.5
-        assert problem.full.bulk.displacement.mixed
+        assert problem.full.bulk.displacement.is_mixed
         assert close(k_n, np.full_like(k_n, 10 * 3 * 1e3 / (2 * (1 + nu)) / h), 1e-9)
 
 

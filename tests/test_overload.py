@@ -53,7 +53,7 @@ def test_a_twist():
         twist.value = share * most
         found = overload(problem)
         assert found.factor == pytest.approx(share, rel=1e-2)
-        assert "rotation about z" in found.in_words()
+        assert "rotation about z" in found.describe()
 
 
 @pytest.mark.each

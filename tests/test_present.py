@@ -559,7 +559,7 @@ def test_where_a_surface_has_no_tangent_plane_there_is_no_residual():
         norm = problem.solver.equations.residual_at(problem.full.state())
         assert problem.full.is_degenerate() == lost
         assert np.isnan(norm) == lost
-        assert not problem.full.is_twisted()
+        assert not problem.full.is_over_rotated()
 
 
 @pytest.mark.parametrize("cell", CELLS)
@@ -567,13 +567,13 @@ def test_facets_that_may_have_met(cell):
     """Where bodies are in each other, or went through each other on the way; else none."""
     pair = Pair(cell, LAWS["coulomb"], kinematics="finite")
     search, before = pair.contact.pairs.search, pair.u.copy()
-    every, counts = len(search.rays.here.facets.cells), []
+    every, counts = len(search.rays.slave.facets.cells), []
     # Apart by more than a cell; into each other; through each other; beyond, and still.
     for old, new in ((-2.0, -3.0), (-2.0, 0.01), (-2.0, 3.0), (3.0, 3.0)):
         pair.place(pair.pressed(pair.nodes, old, 0.0))
         before.x.array[:] = pair.u.x.array
         pair.place(pair.pressed(pair.nodes, new, 0.0))
-        found = search.nearby(pair.u, before, 0.0)
+        found = search.find_candidate_facets(pair.u, before, 0.0)
         total = [COMM.allreduce(len(near)) for near in found]
         counts.append(total)
         if new > old:  # all of Γc lies over the other body

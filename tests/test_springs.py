@@ -23,7 +23,7 @@ K_N, K_T = 7.0, 3.0
 TIGHT = {"snes_rtol": 1e-13}
 
 
-def turned(d: int) -> np.ndarray:
+def rotate(d: int) -> np.ndarray:
     """A rotation that leaves no axis where it was."""
     angle = 0.7
     c, s = np.cos(angle), np.sin(angle)
@@ -66,7 +66,7 @@ def test_springs_of_an_inclined_surface(cell, n, weight):
     """
     d = dimension(cell)
     mesh, tags = block_mesh(cell, n=n, shuffled=True)
-    q = turned(d)
+    q = rotate(d)
     space = displacement_space(mesh, 1)
     on_surface = np.abs(nodes(space)[:, -1]) < 1e-12
     mesh.geometry.x[:, :d] = mesh.geometry.x[:, :d] @ q.T
@@ -106,7 +106,7 @@ def test_springs_between_two_bodies(cell):
     """
     d = dimension(cell)
     mesh, tags = two_blocks(cell, (2, 2))
-    q = turned(d)
+    q = rotate(d)
     space = displacement_space(mesh, 1)
     middle = np.flatnonzero(np.abs(nodes(space)[:, -1] - 0.5) < 1e-12)
     mesh.geometry.x[:, :d] = mesh.geometry.x[:, :d] @ q.T

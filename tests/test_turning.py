@@ -24,7 +24,7 @@ RADIUS = 0.8
 PATH = [(0.0, -0.1, 0.0), (0.06, -0.1, 0.0), (0.1, -0.1, -8.0), (0.02, -0.1, 2.0)]
 
 
-def turned_by(contact, axis):
+def increment_angle(contact, axis):
     """Moment of the contact forces on the body about the axis of the obstacle, as it is now."""
     d = len(axis)
     motion = np.array(contact.values.shift[:1].sum(axis=0))
@@ -38,7 +38,7 @@ def turned_by(contact, axis):
 
 def moment_of(tool):
     """The same of a `Tool`."""
-    return turned_by(tool.contact, tool.vector(0.0, tool.scene.height + RADIUS))
+    return increment_angle(tool.contact, tool.vector(0.0, tool.scene.height + RADIUS))
 
 
 def roll(tool, side, up, moment):
@@ -156,7 +156,7 @@ def test_a_platen_pressed_eccentrically(cell):
         problem.solve()
         problem.commit()
         assert contact.resultants().force[-1] == pytest.approx(-40.0, rel=1e-9)
-        assert abs(turned_by(contact, about) - value) < 1e-9 * 40.0 * 2.0
+        assert abs(increment_angle(contact, about) - value) < 1e-9 * 40.0 * 2.0
         angles.append(float(contact.free_angle.value))
     # A force down has the moment of one to the left of the middle.
     assert abs(angles[0]) < 1e-12
@@ -321,7 +321,7 @@ def test_two_rollers():
         problem.commit()
         assert made[0].resultants().force[1] == pytest.approx(force.value, rel=1e-9)
         for contact, y, sign in zip(made, (-0.6, 1.6), (1, -1), strict=True):
-            assert abs(turned_by(contact, (0.5, y)) - sign * turning) < 1e-9 * 20 * 0.6
+            assert abs(increment_angle(contact, (0.5, y)) - sign * turning) < 1e-9 * 20 * 0.6
         angles = [float(contact.free_angle.value) for contact in made]
         assert angles[0] == pytest.approx(-angles[1], rel=1e-9)
     assert abs(angles[0]) > 1e-3
@@ -434,7 +434,7 @@ def test_a_turn_of_more_than_a_right_angle_is_no_trial():
     for angle, twisted in ((1.5, False), (-1.5, False), (1.6, True), (-7.0, True)):
         turned = angle * tool.contact.motions[-1].length
         system.set_state(start + unknowns.joined(np.zeros(unknowns.n_dofs), np.array([turned])))
-        assert system.is_twisted() == twisted
+        assert system.is_over_rotated() == twisted
 
 
 def test_nothing_holds_a_smooth_roller():

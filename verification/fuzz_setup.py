@@ -572,11 +572,13 @@ def _record_slip_resets(setup: SceneSetup, contact: fc.Contact) -> None:
         }
         count(points)
 
-    def begin_between(opposite: Any) -> None:
-        setup.paired_at[contact.name] = _gather_displacement(setup, opposite.pairs.found_at)
+    def start_with_pairs(opposite: Any) -> None:
+        setup.paired_at[contact.name] = _gather_displacement(
+            setup, opposite.pairs.pairing_displacement
+        )
         begin(opposite)
 
-    begin, contact.states.begin_between = contact.states.begin_between, begin_between  # type: ignore[method-assign]
+    begin, contact.states.start_with_pairs = contact.states.start_with_pairs, start_with_pairs  # type: ignore[method-assign]
     displace = contact.contact_kinematics.displaced
     contact.contact_kinematics.displaced = displaced  # type: ignore[method-assign]
     count = contact.states.set_slip_reference

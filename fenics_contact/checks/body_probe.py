@@ -16,7 +16,7 @@ from fenics_contact.checks.penetration import (
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import gather_rows, global_max, global_mean, global_min
-from fenics_contact.surface.crossings import MovingFacets, find_crossings, largest_depth_on_path
+from fenics_contact.surface.crossings import MovingFacets, find_crossings, max_penetration_on_path
 from fenics_contact.surface.facets import across
 from fenics_contact.surface.rays import Hits, Rays, Side
 from fenics_contact.types import Array, Index, Mask
@@ -53,10 +53,10 @@ class OpposingBodyProbe:
         self._comm = contact.surface.mesh.comm
         self._rows = contact.quadrature.point_rows
         values = contact.values
-        slave, master = search.rays.here, search.rays.there
+        slave, master = search.rays.slave, search.rays.master
         deepest = global_max(self._comm, values.depth)
-        near, opposing = search.nearby(self.u, self._before, deepest)
-        present = search.present_hits(values.x, contact.u, values.depth, near)
+        near, opposing = search.find_candidate_facets(self.u, self._before, deepest)
+        present = search.trace_present(values.x, contact.u, values.depth, near)
         self._slave = _Surface(slave, self.u, present.facet, present.reference)
         self._master = _Surface(master, self.u, *master.facets.lattice(opposing))
         everywhere, n_facets = np.arange(len(self._master.facet)), len(self._master.side.body)
@@ -197,13 +197,13 @@ class _Surface:
         """
         facet, reference = self.facet[some], self.reference[some]
         facets = self.side.facets
-        return rays.follow(
+        return rays.trace(
             facet,
             reference,
             facets.normals(facet, reference, u),
             u,
             bound,
-            back=self.side is rays.there,
+            back=self.side is rays.master,
             undeformed=facets.normals(facet, reference),
             before=u,  # for the tangents
         )
@@ -211,7 +211,7 @@ class _Surface:
     def moving_facets(self, before: fem.Function, shift: Array) -> MovingFacets:
         """Return this rank's facets in the increment, with their start moved by a shift."""
         side, facets = self.side, self.side.facets
-        start, end = facets.moved_corners(before) + shift, facets.moved_corners(self._u)
+        start, end = facets.displaced_corners(before) + shift, facets.displaced_corners(self._u)
         return MovingFacets(start, end, facets.outward, side.vertices[side.own])
 
     def find_crossed(
@@ -245,7 +245,7 @@ class _Surface:
         # A position that slides sideways off the body is deep below a facet that it has left.
         index, since = place[is_too_deep], hits.time[last][is_too_deep]
         ends = start[index], self.place[index]
-        path = largest_depth_on_path(self._comm, *ends, since, vertices[index], facets)
+        path = max_penetration_on_path(self._comm, *ends, since, vertices[index], facets)
         crossed[index] |= path > allowed[index]
         return crossed
 

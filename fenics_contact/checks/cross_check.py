@@ -11,8 +11,8 @@ import ufl
 from fenics_contact.checks.verdict import ForceBalance
 from fenics_contact.compiling import compile_form
 from fenics_contact.contact.contact import Contact
-from fenics_contact.parallel import global_sum, longest
-from fenics_contact.surface.mass import assembled
+from fenics_contact.parallel import global_sum, max_norm
+from fenics_contact.surface.mass import assemble_values
 from fenics_contact.types import Array
 
 __all__ = ["CrossCheck"]
@@ -40,10 +40,10 @@ class CrossCheck:
             by_points, by_form = self._forces(contact)
             tangential = np.linalg.norm(values.tangential_stiffness, axis=(1, 2))
             stiffness = values.normal_stiffness + tangential
-            magnitude = contact.moved() + np.abs(values.initial_gap)
+            magnitude = contact.displacement_magnitude() + np.abs(values.initial_gap)
             sensitivity = float(global_sum(comm, contact.measure @ (stiffness * magnitude)))
             d = values.x.shape[1]
-            sizes = (longest(comm, f.reshape(-1, d)) for f in (by_points - by_form, by_points))
+            sizes = (max_norm(comm, f.reshape(-1, d)) for f in (by_points - by_form, by_points))
             residual, force = (float(size) for size in sizes)
             allowed = 1e-10 * force + _SUMMATION_ROUND_OFF_RATIO * sensitivity
             balances[contact.name] = ForceBalance(residual, force, allowed)
@@ -72,4 +72,4 @@ class CrossCheck:
             )
             form = contact.form_at(displacement, ufl.TestFunction(contact.u.function_space))
             self._forms[contact.name] = compile_form(-form, contact.entity_maps)
-        return by_points, assembled(self._forms[contact.name])[: by_points.size].copy()
+        return by_points, assemble_values(self._forms[contact.name])[: by_points.size].copy()

@@ -68,7 +68,7 @@ class EnergyState:
             rotates: tractions, displacement relative to the obstacle in its frame, displacement of
             the body minus the unknown motion of the obstacle, and the axes of the frame,
             (3 + gdim, n_points, gdim); with a given moment also
-            `ContactKinematics.turning_rate` and the angle.
+            `ContactKinematics.rotation_derivative` and the angle.
         springs: For each contact, the energy in the contact springs at the points, (n_points,).
     """
 
@@ -127,7 +127,7 @@ class EnergyState:
             add(2, springs_end - springs_start, groups)
             mean = contact.measure[:, None] * 0.5 * (start[0] + end[0])
             relative, obstacle = end[1] - start[1], end[2] - start[2]
-            if contact.contact_kinematics.turns:
+            if contact.contact_kinematics.has_rotation:
                 # With the mean of the axes, normal pressure does no work on a rotating obstacle.
                 d = end.shape[2]
                 axes = 0.5 * (start[3 : 3 + d] + end[3 : 3 + d])
@@ -177,10 +177,10 @@ class EnergyState:
 def _contact_rows(contact: Contact, traction: Array) -> Array:
     """Return the rows of `EnergyState.contacts` of one contact."""
     jump = contact.values.jump
-    if not contact.contact_kinematics.turns:
+    if not contact.contact_kinematics.has_rotation:
         return np.stack([traction, jump, contact.values.shift])
     units = np.eye(jump.shape[1])
-    axes = [contact.contact_kinematics.turned(np.broadcast_to(unit, jump.shape)) for unit in units]
+    axes = [contact.contact_kinematics.rotate(np.broadcast_to(unit, jump.shape)) for unit in units]
     # Forces on the obstacle are loads, which include their work already.
     own = contact.own_displacement()
     for component, motion in contact.free_motion.items():
@@ -188,7 +188,7 @@ def _contact_rows(contact: Contact, traction: Array) -> Array:
     rows = [traction, jump, own, *axes]
     if contact.free_angle is not None:
         angle = float(contact.free_angle.value)
-        rows += [contact.contact_kinematics.turning_rate(), np.full_like(jump, angle)]
+        rows += [contact.contact_kinematics.rotation_derivative(), np.full_like(jump, angle)]
     return np.stack(rows)
 
 

@@ -21,7 +21,7 @@ from fenics_contact.surface.facets import facet_nodes
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Mask
-from fenics_contact.wording import place_in_words
+from fenics_contact.wording import format_point
 
 __all__ = [
     "check_contacts",
@@ -62,7 +62,7 @@ def find_displacement(u: fem.Function, contacts: Sequence[Contact]) -> Displacem
         displacement, first = contact.displacement, contacts[0].displacement
         if displacement.whole is not u:
             raise ValueError(f"{contact.name}: its u is not the u of the problem; use the same")
-        if not displacement.same_part(first):
+        if not displacement.is_same_part(first):
             raise ValueError(
                 f"{contact.name}: its u is another part of the mixed function than that of "
                 f"{contacts[0].name}; all contacts must have the same displacement"
@@ -210,7 +210,7 @@ def _check_obstacle_outside(contact: Contact) -> None:
     """Raise a ValueError if an obstacle is inside of a body whose Γc faces away. Collective."""
     if contact.contact_kinematics.sampler is None:
         return
-    mesh, values, places = contact.surface.mesh, contact.values, contact.facet_places
+    mesh, values, places = contact.surface.mesh, contact.values, contact.facet_sampling
     comm, facets = mesh.comm, places.facets
 
     gap, normal = contact.contact_kinematics.sampler.sample(values.x)
@@ -243,7 +243,7 @@ def _check_obstacle_outside(contact: Contact) -> None:
     if first < len(closest):
         raise ValueError(
             f"{contact.name}: the obstacle is inside of the undeformed body, as at "
-            f"{place_in_words(closest[first])}, and all of the body's Γc faces away from it: "
+            f"{format_point(closest[first])}, and all of the body's Γc faces away from it: "
             "check its position, its units and the direction of its normal"
         )
 

@@ -15,7 +15,7 @@ from fenics_contact.checks.condition import Condition
 from fenics_contact.contact.body import NEGLIGIBLE_SLIDE
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import global_mean, global_min, global_sum, longest
+from fenics_contact.parallel import global_mean, global_min, global_sum, max_norm
 from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Mask
@@ -224,7 +224,7 @@ class Deviation:
         size = np.linalg.norm(values.x, axis=1) + contact.quadrature.facet_sizes
         tolerance = ROUND_OFF * size
         if not contact.rigid:  # the deviation of closed points is due to faceting
-            tolerance += longest(contact.surface.mesh.comm, np.nan_to_num(change[closed]))
+            tolerance += max_norm(contact.surface.mesh.comm, np.nan_to_num(change[closed]))
         closing = known & ~closed & (deformed < -tolerance)
         gap = np.where(closing, deformed, 0.0)
         gap = np.where(known & closed & ~lost, np.nan_to_num(change), gap)
@@ -249,9 +249,9 @@ def _has_moved(contact: Contact) -> bool:
     smallest = global_min(comm, contact.quadrature.facet_sizes, empty=np.inf)
     x, u = values.x, contact.own_displacement()
     # A point without a pair may find one wherever it moves.
-    slide = longest(comm, np.where(contact.paired[:, None], values.slide, u))
-    size = max(longest(comm, x - global_mean(comm, x)), 1e-300)
-    rotation = longest(comm, u - global_mean(comm, u)) / size
+    slide = max_norm(comm, np.where(contact.paired[:, None], values.slide, u))
+    size = max(max_norm(comm, x - global_mean(comm, x)), 1e-300)
+    rotation = max_norm(comm, u - global_mean(comm, u)) / size
     return not (slide <= NEGLIGIBLE_SLIDE * smallest and rotation <= _NEGLIGIBLE_ROTATION_RATIO)
 
 
@@ -308,12 +308,12 @@ def _is_notable(contact: Contact, deviation: Deviation, group: _Group, modulus: 
     sums = global_sum(comm, [measure @ (contact.pressure[own] > 0), measure.sum()])
     size = float(sums[0] or sums[1]) ** (1 / (contact.points.shape[1] - 1)) or 1.0
     if unloaded:
-        gap = longest(comm, deviation.gap[own & deviation.closing])
+        gap = max_norm(comm, deviation.gap[own & deviation.closing])
         return not modulus / size * gap <= 0.0
-    largest = longest(comm, traction)
-    rotated = largest * longest(comm, deviation.normal_change[own])
-    elastic = modulus / size * longest(comm, deviation.gap[own])
-    lost = longest(comm, traction[deviation.lost[own]])
+    largest = max_norm(comm, traction)
+    rotated = largest * max_norm(comm, deviation.normal_change[own])
+    elastic = modulus / size * max_norm(comm, deviation.gap[own])
+    lost = max_norm(comm, traction[deviation.lost[own]])
     return not max(rotated, elastic, lost) <= _NEGLIGIBLE_CHANGE_RATIO * largest
 
 
@@ -331,7 +331,7 @@ def _relative_errors(
     pressure = contact.pressure[own]
     force_change = global_sum(comm, measure @ change)
     size = float(global_sum(comm, measure @ np.linalg.norm(contact.traction[own], axis=1)))
-    largest = longest(comm, pressure) or 1.0  # squares must not overflow
+    largest = max_norm(comm, pressure) or 1.0  # squares must not overflow
     normal = np.sum(change * contact.values.normal[own], axis=1) / largest
     squares = [measure @ normal**2, measure @ (pressure / largest) ** 2]
     changed, whole = np.sqrt(global_sum(comm, squares))

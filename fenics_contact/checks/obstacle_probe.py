@@ -38,8 +38,8 @@ _BISECTIONS = 20
 class RigidObstacleProbe:
     """Positions of Γc in the frame of a rigid obstacle, and their paths in an increment.
 
-    The constructor samples the obstacle at `FacetPlaces` and where it is deepest below each facet.
-    It is collective.
+    The constructor samples the obstacle at `FacetSampling` and where it is deepest below each
+    facet. It is collective.
 
     Args:
         before: Displacement at the last commit; None if unknown.
@@ -69,7 +69,7 @@ class RigidObstacleProbe:
     ) -> None:
         kinematics, values = contact.contact_kinematics, contact.values
         assert kinematics.sampler is not None
-        self.places = places = contact.facet_places
+        self.places = places = contact.facet_sampling
         self.sampler = kinematics.sampler
         self.comm = contact.surface.mesh.comm
         self.points = values.x + values.jump
@@ -78,7 +78,7 @@ class RigidObstacleProbe:
         self._shape = self.sampler.shape
         self.rotation = kinematics.rotation_in_increment(values)
         self.field = self._in_frame(contact, contact.u)
-        if committed is not None and not kinematics.turns:
+        if committed is not None and not kinematics.has_rotation:
             self.start = committed.field
         else:
             self.start = places.at_nodes(
@@ -163,7 +163,7 @@ class RigidObstacleProbe:
         The probe of an obstacle that rotates or changes its shape is not valid again.
         """
         valid = np.array_equal(self._shape, self.sampler.shape)
-        valid = valid and not contact.contact_kinematics.turns
+        valid = valid and not contact.contact_kinematics.has_rotation
         displacement = self._at(self._in_frame(contact, contact.u)) - self.z
         size = self.places.size[self.facet]
         clearance = DEPTH_RESOLUTION * size + self.distance
@@ -241,8 +241,8 @@ class RigidObstacleProbe:
         """Return the nodes of Γc at a time from 0 to 1, in the frame of the obstacle."""
         if time in (0.0, 1.0):
             return self.field if time else self.start
-        end = self.rotation.turned(self.field, 1.0)
-        return self.rotation.turned(self.start + time * (end - self.start), -time)
+        end = self.rotation.rotate(self.field, 1.0)
+        return self.rotation.rotate(self.start + time * (end - self.start), -time)
 
     def _find_crossed_between(self, since: float, until: float, allowed: Array) -> Array:
         """Return the undeformed positions that cross the obstacle between two times. Collective.
@@ -264,7 +264,7 @@ class RigidObstacleProbe:
             distance_end, toward = self.sampler.sample(end)
         toward = np.nan_to_num(toward)
         angle = abs(self.rotation.angle) * (until - since)
-        path = np.linalg.norm(self.rotation.turned(end, until - since) - start, axis=1)
+        path = np.linalg.norm(self.rotation.rotate(end, until - since) - start, axis=1)
         radius = np.maximum(self.rotation.radius(start), self.rotation.radius(end))
         # A distance changes by no more than the path: positions farther away were not touched, and
         # those inside of the body were outside, or inside by the depth allowed.
@@ -368,7 +368,7 @@ class RigidObstacleProbe:
         duration = until - since
         distance, first = self.sampler.sample(start, since)
         distance_end, _ = self.sampler.sample(end, until)
-        end = self.rotation.turned(end, duration)
+        end = self.rotation.rotate(end, duration)
         length = np.linalg.norm(end - start, axis=1) + np.abs(distance) + np.abs(distance_end)
         resolution = length * 2.0 ** (2 - _BISECTIONS)
         low: Array = np.zeros(len(start))
@@ -376,7 +376,7 @@ class RigidObstacleProbe:
         for _ in range(_BISECTIONS):
             middle = (low + high) / 2
             place = start + middle[:, None] * (end - start)
-            place = self.rotation.turned(place, -middle * duration)
+            place = self.rotation.rotate(place, -middle * duration)
             distance, normal = self.sampler.sample(place, since + middle * duration)
             # Continue in the half in which the obstacle is entered, or its normal turns.
             before = (distance >= 0) & (dot(first, normal) > OPPOSITE_SIDES)

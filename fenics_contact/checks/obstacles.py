@@ -56,7 +56,9 @@ class ObstacleCheck:
         if curvature is not None and not contact.obstacle.is_flat:
             depth = global_max(comm, (contact.values.penetration * curvature)[closed])
         has_friction = contact.law.has_friction and comm.allreduce(int(closed.any())) > 0
-        angle = abs(contact.contact_kinematics.turned_by(contact.values)) if has_friction else 0.0
+        angle = (
+            abs(contact.contact_kinematics.increment_angle(contact.values)) if has_friction else 0.0
+        )
         return cls(type(contact.obstacle).__name__, error, depth, angle)
 
     def conditions(self, contact: str) -> list[Condition]:

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from fenics_contact.checks.penetration import DEPTH_RESOLUTION, OPPOSITE_SIDES
 from fenics_contact.parallel import gather_rows
 from fenics_contact.surface.crossings import MovingFacets, find_crossings
-from fenics_contact.surface.facet_places import FacetPlaces
+from fenics_contact.surface.facet_sampling import FacetSampling
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["SurfacePieces", "depth_below_surface"]
@@ -41,7 +41,7 @@ class SurfacePieces:
 
     @classmethod
     def of(
-        cls, comm: MPI.Comm, places: FacetPlaces, field: Array, facet: Index, allowed: Array
+        cls, comm: MPI.Comm, places: FacetSampling, field: Array, facet: Index, allowed: Array
     ) -> SurfacePieces:
         """Gather the pieces of all ranks. Collective.
 
@@ -50,7 +50,7 @@ class SurfacePieces:
         """
         bound: Array = np.zeros(len(places.size))
         np.maximum.at(bound, facet, allowed)
-        facets, middles = places.moving_facets(field, field), places.piece_middles()
+        facets, middles = places.moving_facets(field, field), places.piece_centres()
         bound = np.repeat(bound, len(middles) // max(len(bound), 1))
         table = np.column_stack([bound, facets.start[:, 0], facets.normals(), middles])
         table = gather_rows(comm, table)

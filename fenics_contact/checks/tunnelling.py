@@ -23,7 +23,7 @@ from fenics_contact.checks.penetration import ResistedDepth
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import gather_rows
 from fenics_contact.types import Array
-from fenics_contact.wording import place_in_words
+from fenics_contact.wording import format_point
 
 __all__ = ["Tunnelling", "TunnellingCheck"]
 
@@ -64,14 +64,14 @@ class Tunnelling:
         """Return the conditions on a contact of this name."""
         too_deep = (
             f"{contact}: the obstacle penetrates between the quadrature points of Γc, by "
-            f"{self.depth:.3e} near {place_in_words(self.place or [])} in the undeformed body, "
+            f"{self.depth:.3e} near {format_point(self.place or [])} in the undeformed body, "
             f"where the points around allow {self.allowed:.3e}; refine Γc there or give "
             "ContactSurface a larger quadrature_degree; between two bodies let the finer surface "
             "be Γc, or add a second contact with the surfaces swapped"
         )
         has_crossed = (
             f"{contact}: in one increment a part of Γc has crossed the obstacle, at "
-            f"{place_in_words(self.crossed or [])} in the undeformed body; load in smaller steps "
+            f"{format_point(self.crossed or [])} in the undeformed body; load in smaller steps "
             "(increments() cuts them by itself), and include in Γc and in the opposite surface all "
             "sides that may touch"
         )

@@ -12,8 +12,8 @@ from fenics_contact.checks.obstacles import ObstacleCheck
 from fenics_contact.checks.tunnelling import Tunnelling
 from fenics_contact.contact.contact import Contact
 from fenics_contact.markup import html_table
-from fenics_contact.parallel import global_max, global_min, longest
-from fenics_contact.systems.balance import MOST_EXCUSED
+from fenics_contact.parallel import global_max, global_min, max_norm
+from fenics_contact.systems.balance import MAX_ROUND_OFF_RESIDUAL_RATIO
 from fenics_contact.types import Array
 from fenics_contact.wording import percent
 
@@ -143,7 +143,8 @@ class Verdict:
         return {
             name: balance.residual / balance.force
             for name, balance in self.equations.items()
-            if balance.residual > MOST_EXCUSED * balance.force and balance.round_off > 0
+            if balance.residual > MAX_ROUND_OFF_RESIDUAL_RATIO * balance.force
+            and balance.round_off > 0
         }
 
     @property
@@ -313,7 +314,7 @@ def check_laws(contact: Contact) -> dict[str, float]:
         v = v.at(paired)
 
     def worst(*violations: Array) -> float:
-        return max(longest(comm, x) for x in violations)
+        return max(max_norm(comm, x) for x in violations)
 
     def relative(value: float, *scales: Array) -> float:
         scale = worst(*scales)
@@ -366,7 +367,7 @@ def check_laws(contact: Contact) -> dict[str, float]:
     travel = (v.jump, v.increment, change, round_off, _SCALED_ROUND_OFF_RATIO * elastic_slip)
     errors["cone"] = relative(worst(np.maximum(functions, 0)), bound)
     # Without pressure the bound may be zero instead of that of the law.
-    difference = np.where((r_n < 0) | (bound != 0.0), bound - v.bound_of_law, 0.0)
+    difference = np.where((r_n < 0) | (bound != 0.0), bound - v.law_friction_bound, 0.0)
     errors["friction bound"] = relative(worst(difference), bound)
     errors["slip"] = relative(worst(np.minimum(beta, 0), (missing - slip)[closed]), *travel)
     errors["dissipation"] = relative(

@@ -65,7 +65,7 @@ class BodySmall(ContactKinematics):
     @property
     def updates_pairs(self) -> bool:
         """Whether pairs are updated at every commit and where bodies slide."""
-        has_updated = self.pairs.found_at is not None
+        has_updated = self.pairs.pairing_displacement is not None
         return self._update_policy == "increment" or (self._update_policy == "auto" and has_updated)
 
     @property
@@ -131,7 +131,7 @@ class BodySmall(ContactKinematics):
     def find_pairs(self, u: fem.Function | None, depth: Array) -> None:
         """Find the opposite points in a displacement. Collective."""
         self.update_data()
-        self._parts.displacement.follow()
+        self._parts.displacement.update()
         self.pairs.find(self.data.values["x"], self.data.values["normal"], depth, u)
 
     def resume(self, depth: Array, evaluate: Callable[[], PointValues], *, new_pairs: bool) -> None:
@@ -172,7 +172,7 @@ class BodyFinite(BodySmall):
         """Update data, pairs and jump to the present data and ``u``. Collective."""
         self.update_data()
         data, history = self.data.values, self._parts.history
-        self._parts.displacement.follow()
+        self._parts.displacement.update()
         self._finite.update(data["x"], data["normal"], history, self._parts.multipliers or history)
         self._update_jump()
 
@@ -183,7 +183,7 @@ class BodyFinite(BodySmall):
         if not self._parts.law.has_friction:
             return outputs
         outputs |= self._to_history_frame(arrays, normal)
-        traction = pairs.turned(self._parts.history.values("traction"))
+        traction = pairs.rotate(self._parts.history.values("traction"))
         traction -= np.sum(traction * normal, axis=1)[:, None] * normal
         zeros = np.zeros_like(normal)
         return outputs | {"projection_point": zeros, "carried_traction": traction}
@@ -198,9 +198,9 @@ class BodyFinite(BodySmall):
         """Return the gap of the undeformed Γc, (n_points,) (length)."""
         return self._finite.undeformed_gap
 
-    def turned(self, vectors: Array, *, back: bool = False) -> Array:
+    def rotate(self, vectors: Array, *, inverse: bool = False) -> Array:
         """Return vectors rotated with the surface from the committed state, or back."""
-        return self._finite.turned(vectors, back=back)
+        return self._finite.rotate(vectors, inverse=inverse)
 
     @property
     def updates_pairs(self) -> bool:
@@ -233,7 +233,7 @@ class BodyFinite(BodySmall):
 
     def to_history(self, fields: Mapping[str, Array]) -> dict[str, Array]:
         """Return fields of a solution with vectors rotated with the surface."""
-        rotated = {n: self.turned(fields[n]) for n in ("traction", "jump") if n in fields}
+        rotated = {n: self.rotate(fields[n]) for n in ("traction", "jump") if n in fields}
         return dict(fields) | rotated
 
     def resume(self, depth: Array, evaluate: Callable[[], PointValues], *, new_pairs: bool) -> None:

@@ -23,7 +23,7 @@ from fenics_contact.laws.base import Law
 from fenics_contact.obstacles.base import Obstacle
 from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.surface.displacement import Displacement, check_kind
-from fenics_contact.surface.facet_places import FacetPlaces
+from fenics_contact.surface.facet_sampling import FacetSampling
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import ContactSurface, tagged_facets
 from fenics_contact.types import Array, Mask
@@ -382,9 +382,9 @@ class Contact(PointResults):
         return TraceProjection(self.quadrature, self.displacement.degree)
 
     @cached_property
-    def facet_places(self) -> FacetPlaces:
+    def facet_sampling(self) -> FacetSampling:
         """Additional points on the facets of Γc, between the quadrature points. Collective."""
-        return FacetPlaces(self.quadrature, self.u.function_space, self.points)
+        return FacetSampling(self.quadrature, self.u.function_space, self.points)
 
     # ---- state -----------------------------------------------------------------------------------
 
@@ -417,7 +417,7 @@ class Contact(PointResults):
         Raises:
             ValueError: The enforcement is not "augmented".
         """
-        return self._augmented().error(self.values, self.history, self.moved())
+        return self._augmented().error(self.values, self.history, self.displacement_magnitude())
 
     def augment(self) -> float:
         """Set the multipliers to the projected tractions at the present ``u``. Collective.
@@ -434,12 +434,12 @@ class Contact(PointResults):
         """
         multipliers = self._augmented()
         self.evaluate()
-        error = multipliers.error(self.values, self.history, self.moved())
+        error = multipliers.error(self.values, self.history, self.displacement_magnitude())
         multipliers.take(multipliers.augmented(self.values)[1], self.values)
         self.states.forget()
         return error
 
-    def moved(self) -> Array:
+    def displacement_magnitude(self) -> Array:
         """Return |u| + |⟦u⟧| at this rank's points, the scale of the jump's round-off. Collective.
 
         Returns:

@@ -91,17 +91,17 @@ class IncrementalRotation:
     about: Array | float = 0.0
     rotation: Rotation | None = None
 
-    def turned(self, positions: Array, fraction: Array | float) -> Array:
+    def rotate(self, positions: Array, fraction: Array | float) -> Array:
         """Return positions rotated by fractions of the angle, one or (n,): (n, gdim) (length)."""
         if self.rotation is None:
             return positions
-        return self.about + self.rotation.turned(positions - self.about, fraction * self.angle)
+        return self.about + self.rotation.rotate(positions - self.about, fraction * self.angle)
 
     def directions(self, vectors: Array) -> Array:
         """Return directions rotated by the angle, (..., gdim)."""
         if self.rotation is None:
             return vectors
-        turned = self.rotation.turned(vectors.reshape(-1, vectors.shape[-1]), self.angle)
+        turned = self.rotation.rotate(vectors.reshape(-1, vectors.shape[-1]), self.angle)
         return turned.reshape(vectors.shape)
 
     def radius(self, positions: Array) -> Array:
@@ -266,7 +266,7 @@ class ContactKinematics(ABC):
     def _update_jump(self) -> None:
         """Evaluate the jump at the present ``u``. Collective."""
         displacement = self._parts.displacement
-        displacement.follow()
+        displacement.update()
         self.pairs.jump_map.mult(displacement.u.x.petsc_vec, self.jump.x.petsc_vec)
         if self._displaced is not None:
             rows = self.jump.x.array[: self.committed_jump.size].reshape(-1, self._gdim)
@@ -282,7 +282,7 @@ class ContactKinematics(ABC):
         finally:
             self._displaced = None
 
-    def displaced_directions(self, vectors: Array) -> Array:
+    def rotate_to_displaced(self, vectors: Array) -> Array:
         """Return directions (..., n_points, gdim) of point motions at the displaced positions."""
         return vectors if self._displaced is None else self._displaced.turn.directions(vectors)
 
@@ -335,12 +335,12 @@ class ContactKinematics(ABC):
         return False
 
     @property
-    def turns(self) -> bool:
+    def has_rotation(self) -> bool:
         """Whether the obstacle rotates."""
         return self._parts.inputs.rotation is not None
 
-    def turned(self, vectors: Array, *, back: bool = False) -> Array:
-        """Return vectors rotated from the frame of the history to space, or back: (n_points, d)."""
+    def rotate(self, vectors: Array, *, inverse: bool = False) -> Array:
+        """Return vectors rotated from the frame of the history to space, or back, (n_points, d)."""
         return vectors
 
     def _to_history_frame(self, arrays: Mapping[str, Array], normal: Array) -> dict[str, Array]:
@@ -348,14 +348,14 @@ class ContactKinematics(ABC):
         framed = {"framed_normal": normal, "framed_traction": arrays["traction"]}
         if "elastic_slip" in arrays:
             framed["elastic_slip"] = arrays["elastic_slip"]
-        return {name: self.turned(vectors, back=True) for name, vectors in framed.items()}
+        return {name: self.rotate(vectors, inverse=True) for name, vectors in framed.items()}
 
     def committed_offset(self, values: PointValues) -> Array:
         """Return the offset to the committed positions relative to the obstacle (length).
 
         At the committed ``u`` it is the displacement of a rigid obstacle since the last commit.
         """
-        return self.turned(self.committed_jump - values.jump)
+        return self.rotate(self.committed_jump - values.jump)
 
     def motion_in_increment(self, values: PointValues) -> ObstacleMotion:
         """Return the motion of a rigid obstacle from values at the committed ``u``. Collective."""
@@ -376,11 +376,11 @@ class ContactKinematics(ABC):
         arrays = self.data.values if values is None else values.arrays
         return global_max(self._mesh.comm, arrays["angle"])
 
-    def turned_by(self, values: PointValues) -> float:
+    def increment_angle(self, values: PointValues) -> float:
         """Return the rotation angle of the obstacle since the last commit (radians). Collective."""
         return self.angle(values) - self.committed_angle
 
-    def turning_rate(self) -> Array:
+    def rotation_derivative(self) -> Array:
         """Return ω × r at the points for a unit rotation, (n_points, gdim) (length). Collective."""
         rotation = self._parts.obstacle.rotation
         assert rotation is not None
@@ -400,7 +400,7 @@ class ContactKinematics(ABC):
     def in_frame(self, vectors: Array, angle: float) -> Array:
         """Return vectors in the frame of an obstacle rotated by an angle, (n, gdim)."""
         rotation = self._parts.obstacle.rotation
-        return vectors if rotation is None else rotation.turned(vectors, -angle)
+        return vectors if rotation is None else rotation.rotate(vectors, -angle)
 
     def rotation_in_increment(self, values: PointValues) -> IncrementalRotation:
         """Return the rotation of the obstacle since the last commit. Collective."""
@@ -408,7 +408,7 @@ class ContactKinematics(ABC):
         if rotation is None:
             return IncrementalRotation()
         about = values.arrays["about"][:1]  # equal at all points
-        return IncrementalRotation(self.turned_by(values), about, rotation)
+        return IncrementalRotation(self.increment_angle(values), about, rotation)
 
     def largest_curvature(self) -> Array | None:
         """Return the largest principal curvature of a rigid obstacle at X + u (1/length).

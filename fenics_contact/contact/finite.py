@@ -182,12 +182,12 @@ class SampledGeometry:
         """Return a copy of samples: "gap", "slope" (of the gap), "normal" and others."""
         return self._fields.values(name)
 
-    def turned(self, vectors: Array, *, back: bool = False) -> Array:
+    def rotate(self, vectors: Array, *, inverse: bool = False) -> Array:
         """Return vectors rotated from the obstacle's frame to space, or back, (n_points, d)."""
         if not self._rotates:
             return vectors
         axes = np.stack([self.values(f"axis {i}") for i in range(self._d)], axis=1)
-        return np.asarray(np.einsum("qij,qi->qj" if back else "qij,qj->qi", axes, vectors))
+        return np.asarray(np.einsum("qij,qi->qj" if inverse else "qij,qj->qi", axes, vectors))
 
     def __call__(self, jump: Any) -> DeformedGeometry:
         """Return gap and normal at X + u, linearised about the sampled displacement."""

@@ -26,7 +26,7 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact.compat import sparse_matrix
+from fenics_contact.compat import create_csr_matrix
 from fenics_contact.contact.pairs import Pairs, PairsState
 from fenics_contact.contact.point_geometry import PointGeometry, tangential
 from fenics_contact.contact.values import PointValues
@@ -121,7 +121,7 @@ class FiniteSlidingPairs(Pairs):
         """Find the opposite points at the present displacement. Collective."""
         assert self._reference is not None and self._undeformed is not None
         assert self.search is not None and self.indicator is not None
-        side, facet, (xi, undeformed) = self._rays.here.facets, self._rays.facet, self._reference
+        side, facet, (xi, undeformed) = self._rays.slave.facets, self._rays.facet, self._reference
         if self._committed is None:
             x, tangents = side.positions(facet, xi, self._committed_u)
             normal = side.outward_normals(facet, tangents)
@@ -134,7 +134,7 @@ class FiniteSlidingPairs(Pairs):
         depth = self.search.largest(history.values("penetration"))
         if not global_max(self._mesh.comm, np.abs(self._committed_u.x.array)) > 0:
             depth = np.maximum(depth, self._undeformed[1])
-        hits = self._rays.follow(
+        hits = self._rays.trace(
             facet, xi, normal, self._u, depth, undeformed=undeformed, before=self._committed_u
         )
         paired = hits.facet >= 0
@@ -165,8 +165,8 @@ class FiniteSlidingPairs(Pairs):
         present = self._present
         slip, start = np.zeros_like(present.normal), np.zeros_like(present.normal)
         if "traction" in history:
-            slip = self.turned(present.total_slip - history.values("jump"))
-            start = self.turned(traction.values("traction"))
+            slip = self.rotate(present.total_slip - history.values("jump"))
+            start = self.rotate(traction.values("traction"))
         fields = {"gap": present.gap, "normal": present.normal, "slip": slip, "traction": start}
         self.local_jump.assign(fields)
 
@@ -174,7 +174,7 @@ class FiniteSlidingPairs(Pairs):
     def reach(self) -> PETSc.Mat:
         """Map from ``u`` to the nodes on the facets of both surfaces. Collective."""
         assert self.search is not None
-        space, sides = self._u.function_space, (self._rays.here, self._rays.there)
+        space, sides = self._u.function_space, (self._rays.slave, self._rays.master)
         local = np.concatenate([side.facets.nodes for side in sides])
         nodes = space.dofmap.index_map.local_to_global(local.ravel().astype(np.int32))
         all_rows, nodes = np.arange(len(local)), nodes.reshape(local.shape)
@@ -186,10 +186,10 @@ class FiniteSlidingPairs(Pairs):
         assert self._present is not None
         return self._present.total_slip.copy()
 
-    def turned(self, vectors: Array, *, back: bool = False) -> Array:
+    def rotate(self, vectors: Array, *, inverse: bool = False) -> Array:
         """Return vectors rotated by R from the committed bodies, or back, (n_points, d)."""
         assert self._present is not None
-        subscripts = "qij,qi->qj" if back else "qij,qj->qi"
+        subscripts = "qij,qi->qj" if inverse else "qij,qj->qi"
         return np.asarray(np.einsum(subscripts, self._present.rotation, vectors))
 
     def commit(self) -> None:
@@ -212,8 +212,8 @@ class FiniteSlidingPairs(Pairs):
 
     def set_state(self, state: PairsState) -> None:
         """Restore the committed displacement from `state`. Collective."""
-        assert state.found_at is not None
-        self._committed_u.x.array[:] = state.found_at.x.array
+        assert state.pairing_displacement is not None
+        self._committed_u.x.array[:] = state.pairing_displacement.x.array
         self._reset()
 
     @property
@@ -237,7 +237,7 @@ class FiniteSlidingPairs(Pairs):
 
     def _make_local_map(self) -> PETSc.Mat:
         assert self._reference is not None and self._present is not None
-        slave, facet, xi = self._rays.here.facets, self._rays.facet, self._reference[0]
+        slave, facet, xi = self._rays.slave.facets, self._rays.facet, self._reference[0]
         space, d, n = self._u.function_space, self._gdim, len(xi)
         partner = self._present.hits.partner
         nodes, weights = slave.interpolation(facet, xi)
@@ -253,7 +253,7 @@ class FiniteSlidingPairs(Pairs):
         mask = np.abs(values) > ROUND_OFF
         pointers = np.concatenate([[0], np.cumsum(mask.sum(axis=3).ravel())])
         n_columns = space.dofmap.index_map.size_local * bs
-        return sparse_matrix(space.mesh.comm, n_columns, pointers, columns[mask], values[mask])
+        return create_csr_matrix(space.mesh.comm, n_columns, pointers, columns[mask], values[mask])
 
     def tangent(self, by_local_jump: Array, traction: Array, history: PointFields) -> Array:
         """Return the derivative of the point forces by the local unknowns, (n_points, 2 d², 2 d²).

@@ -25,7 +25,7 @@ from fenics_contact.laws.base import Law
 from fenics_contact.parallel import global_max
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.fields import PointFields
-from fenics_contact.surface.mass import mass_solver
+from fenics_contact.surface.mass import create_mass_solver
 from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
@@ -62,7 +62,7 @@ class TraceProjection:
         gram = self._basis.transposeMatMult(weighted)
         weighted.destroy()
         self._right, self._solution = gram.createVecs()
-        self._ksp = mass_solver(gram, rtol=1e-13, atol=1e-300, max_it=500)
+        self._ksp = create_mass_solver(gram, rtol=1e-13, atol=1e-300, max_it=500)
 
     def __call__(self, values: Array) -> Array:
         """Return projected values, (n_points,) or columns (n_points, n). Collective."""

@@ -29,7 +29,7 @@ class PairsState:
     paired: Mask
     n_unpaired: int
     distance: Array
-    found_at: fem.Function | None
+    pairing_displacement: fem.Function | None
     pairing_jump: Array | None
 
 
@@ -50,8 +50,8 @@ class Pairs:
         distance: Distance to the opposite point, a function at the points.
         indicator: 1 at paired points, 0 at others, a function at the points.
         search: Search of the opposing surface.
-        found_at, pairing_jump: Displacement in which the pairs were found, and its jump, (n_points,
-            gdim) (length); None for the undeformed bodies.
+        pairing_displacement, pairing_jump: Displacement in which the pairs were found, and its
+            jump, (n_points, gdim) (length); None for the undeformed bodies.
         degenerate: Whether Γc has no tangent plane at a point of any rank, in a diverged trial
             state of pairs that follow the bodies.
     """
@@ -70,7 +70,7 @@ class Pairs:
         self.search: Pairing | None = None
         self.distance: fem.Function | None = None
         self.indicator: fem.Function | None = None
-        self.found_at: fem.Function | None = None
+        self.pairing_displacement: fem.Function | None = None
         self.pairing_jump: Array | None = None
         self.degenerate = False
         if isinstance(obstacle, DeformableBody):
@@ -89,7 +89,7 @@ class Pairs:
         self.distance.x.array[: len(distance)] = np.nan_to_num(distance)
         self.distance.x.scatter_forward()
         self._set_pairs(opposite, ~np.isnan(distance))
-        self.found_at = None if u is None else u.copy()
+        self.pairing_displacement = None if u is None else u.copy()
         self.pairing_jump = None if u is None else self._product(self.jump_map, u)
         if self.number == 1:  # later, bodies that slide off each other have more and more
             self._warn_of_unpaired(reasons)
@@ -128,7 +128,10 @@ class Pairs:
     def state(self) -> PairsState:
         """Return a copy of the pairs."""
         distance = np.zeros(0) if self.distance is None else self.distance.x.array.copy()
-        maps, pairing = (self.jump_map, self.opposite_map), (self.found_at, self.pairing_jump)
+        maps, pairing = (
+            (self.jump_map, self.opposite_map),
+            (self.pairing_displacement, self.pairing_jump),
+        )
         return PairsState(*maps, self.paired, self.n_unpaired, distance, *pairing)
 
     def set_state(self, state: PairsState) -> None:
@@ -138,7 +141,10 @@ class Pairs:
         assert self.distance and self.indicator
         self.jump_map, self.opposite_map = state.jump_map, state.opposite_map
         self.paired, self.n_unpaired = state.paired, state.n_unpaired
-        self.found_at, self.pairing_jump = state.found_at, state.pairing_jump
+        self.pairing_displacement, self.pairing_jump = (
+            state.pairing_displacement,
+            state.pairing_jump,
+        )
         self.number += 1  # results of the pairs in between are out of date
         self.distance.x.array[:] = state.distance
         self.indicator.x.array[: self._quadrature.n_points] = self.paired
@@ -167,9 +173,9 @@ class Pairs:
         """
         assert self.search is not None
         change = self._u.copy()
-        if self.found_at is not None:
-            change.x.array[:] -= self.found_at.x.array
-        nodes = self.search.rays.there.facets.nodes.ravel()
+        if self.pairing_displacement is not None:
+            change.x.array[:] -= self.pairing_displacement.x.array
+        nodes = self.search.rays.master.facets.nodes.ravel()
         mean = global_mean(self._mesh.comm, change.x.array.reshape(-1, self._gdim)[nodes])
         return self._product(self.own_map, change) - mean
 

@@ -63,7 +63,7 @@ class PointData:
         """Return an expression of the laws as a function at the points (UFL)."""
         return self._fields.ufl(name)
 
-    def reads(self, constant: fem.Constant) -> bool:
+    def depends_on(self, constant: fem.Constant) -> bool:
         """Whether an expression depends on a constant."""
         return self._dependence.has(constant)
 

@@ -36,22 +36,24 @@ class PointTangent:
         by_jump: By the jump, (n_points, gdim, gdim) (stress/length); of the point forces by the
             local unknowns if `Pairs.local_map` is not None.
         by_shift: By the displacement of the obstacle; None if no component is free.
-        spun: By a common rotation of body and obstacle, ω × the traction, (n_points, gdim)
+        by_rotation: By a common rotation of body and obstacle, ω × the traction, (n_points, gdim)
             (stress), without the fixed direction of anisotropic friction; None if no moment rotates
             the obstacle.
     """
 
     by_jump: Array
     by_shift: Array | None = None
-    spun: Array | None = None
+    by_rotation: Array | None = None
 
-    def scaled(self, factor: Array) -> PointTangent:
+    def scale(self, factor: Array) -> PointTangent:
         """Return the derivatives times a factor at each point, (n_points,)."""
 
         def times(values: Array) -> Array:
             return values * factor.reshape(-1, *[1] * (values.ndim - 1))
 
-        others = (None if part is None else times(part) for part in (self.by_shift, self.spun))
+        others = (
+            None if part is None else times(part) for part in (self.by_shift, self.by_rotation)
+        )
         return PointTangent(times(self.by_jump), *others)
 
 
@@ -262,7 +264,7 @@ class PointLaw:
             pressure = ufl.variable(-result.normal_traction)
             bound = law.friction_bound(local, pressure, parameters)
             expressions |= {
-                "bound_of_law": self._restrict(bound),
+                "law_friction_bound": self._restrict(bound),
                 "friction_bound_slope": self._restrict(ufl.diff(bound, pressure)),
                 "increment": local.tangential_increment,
                 "old_traction": local.traction,

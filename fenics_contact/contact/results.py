@@ -22,7 +22,7 @@ from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facet_values import facet_values
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import ContactSurface, PointEvaluator, SurfaceQuadrature
-from fenics_contact.tolerances import by_place
+from fenics_contact.tolerances import sort_by_coordinates
 from fenics_contact.types import Array
 
 __all__ = ["PointResults"]
@@ -185,7 +185,7 @@ class PointResults(ABC):
         The tractions of the contact are nominal; divided by the ratio they are Cauchy tractions,
         per deformed area. For axisymmetric bodies multiply it by the hoop stretch 1 + u_r/r.
         """
-        self.displacement.follow()
+        self.displacement.update()
         return self._stretch()["area"]
 
     @cached_property
@@ -313,7 +313,7 @@ class PointResults(ABC):
             ]
         )
         rows = gather_rows(self.surface.mesh.comm, rows)
-        rows = rows[by_place(rows[:, :d])]
+        rows = rows[sort_by_coordinates(rows[:, :d])]
         vectors = {"x": rows[:, :d], "normal": rows[:, d : 2 * d]}
         vectors["tangential_traction"] = rows[:, 2 * d : 3 * d]
         names = ("gap", "pressure", "slip", "status", "measure")

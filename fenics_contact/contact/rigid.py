@@ -147,7 +147,7 @@ class RigidFinite(ContactKinematics):
         if not self._parts.law.has_friction:
             return outputs
         outputs |= self._to_history_frame(arrays, normal)
-        gap_vector = geometry.turned(geometry.values("gap")[:, None] * normal, back=True)
+        gap_vector = geometry.rotate(geometry.values("gap")[:, None] * normal, inverse=True)
         return outputs | {
             "projection_point": jump + gap_vector,
             "carried_traction": geometry.values("committed traction"),
@@ -159,16 +159,16 @@ class RigidFinite(ContactKinematics):
         rotation = self._parts.obstacle.rotation
         if self._parts.inputs.free_angle is None or rotation is None:
             return tangent
-        return replace(tangent, spun=rotation.rate(law.evaluate_traction()))
+        return replace(tangent, by_rotation=rotation.rate(law.evaluate_traction()))
 
     def true_placement(self, values: PointValues) -> tuple[Array, Array]:
         """Return gap and normal at X + u, those of the contact itself. Collective."""
         self.update()
         return self._geometry.values("gap"), self._geometry.values("normal")
 
-    def turned(self, vectors: Array, *, back: bool = False) -> Array:
+    def rotate(self, vectors: Array, *, inverse: bool = False) -> Array:
         """Return vectors rotated from the frame of the obstacle to space, or back."""
-        return self._geometry.turned(vectors, back=back)
+        return self._geometry.rotate(vectors, inverse=inverse)
 
     def gradient_error(self, values: PointValues) -> Array:
         """Return the gradient of the gap at X + u plus the unit normal, its norm. Collective."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import ufl
 
-from fenics_contact.obstacles.base import NOWHERE, Placement, SampledObstacle
+from fenics_contact.obstacles.base import MAX_COORDINATE, Placement, SampledObstacle
 from fenics_contact.parallel import collective_errors
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.surface import PointEvaluator, SurfaceQuadrature
@@ -44,7 +44,7 @@ class SampledPlacement:
         """
         position = self._evaluate()["position"]
         # Diverged iterates are not sampled.
-        position[~(np.abs(position).max(axis=1, initial=0.0) < NOWHERE)] = np.nan
+        position[~(np.abs(position).max(axis=1, initial=0.0) < MAX_COORDINATE)] = np.nan
         changed = np.any(position != self._sampled_at, axis=1) & np.isfinite(position[:, 0])
         fields, d = {n: self._fields.values(n) for n in self._fields.names}, self._obstacle.gdim
         with collective_errors(self._comm):

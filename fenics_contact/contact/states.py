@@ -120,7 +120,7 @@ class ContactStates:
             self.history.assign(start | self._kinematics.reference_fields())
         self.set_state(ContactState(self.history.rows(), self._kinematics.state()))
 
-    def begin_between(self, kinematics: KinematicsState) -> None:
+    def start_with_pairs(self, kinematics: KinematicsState) -> None:
         """Start the increment with other pairs and their committed jump. Collective."""
         jump_change = kinematics.jump - self._kinematics.committed_jump
         self._kinematics.set_state(kinematics)
@@ -181,9 +181,12 @@ class ContactStates:
         if jump_change is not None and self._law.has_friction:
             history["jump"] = history["jump"] + jump_change
         rows, commits = self.history.packed(history), self.committed.commits + 1
-        before, kinematics = self.committed.kinematics.pairs.found_at, self._kinematics.state()
+        before, kinematics = (
+            self.committed.kinematics.pairs.pairing_displacement,
+            self._kinematics.state(),
+        )
         self.set_state(ContactState(rows, kinematics, trial.points, commits))
-        is_first_update = before is None and kinematics.pairs.found_at is not None
+        is_first_update = before is None and kinematics.pairs.pairing_displacement is not None
         comm = self.history.function.function_space.mesh.comm
         if is_first_update and comm.rank == 0:
             logger.info(

@@ -116,7 +116,7 @@ class PointValues:
         increment: Δu_t since the last commit (length).
         old_traction: τ at the start of the increment (stress).
         friction_bound: Size of the yield surface (stress).
-        bound_of_law: `Law.friction_bound` at the contact pressure (stress).
+        law_friction_bound: `Law.friction_bound` at the contact pressure (stress).
         friction_bound_slope: Its derivative by the pressure.
         dissipated: Frictional dissipation per area.
         slip_increment: Δβ of every mode, (n_points, n_modes) (length).
@@ -153,7 +153,7 @@ class PointValues:
     increment: Array
     old_traction: Array
     friction_bound: Array
-    bound_of_law: Array
+    law_friction_bound: Array
     friction_bound_slope: Array
     dissipated: Array
     slip_increment: Array
@@ -178,7 +178,7 @@ class PointValues:
         # Members that some laws do not need; all others are always evaluated.
         scalars = (
             *("normal_reaction", "friction_bound_ratio", "circumradius", "friction_bound"),
-            *("bound_of_law", "friction_bound_slope", "dissipated", "multiplier", "depth"),
+            *("law_friction_bound", "friction_bound_slope", "dissipated", "multiplier", "depth"),
         )
         vectors = ("slide", "traction", "increment", "old_traction", "elastic_slip")
         members: dict[str, Any] = dict.fromkeys(scalars, zero) | dict.fromkeys(vectors, zeros)
@@ -220,7 +220,7 @@ class PointValues:
         return np.where(trial > 0, traction / np.where(trial > 0, trial, 1.0), 1.0)
 
     @property
-    def slips(self) -> Mask:
+    def is_slipping(self) -> Mask:
         """Mask of the points that slip against friction, including open ones, (n_points,)."""
         return np.asarray(np.any(self.slip_increment != 0, axis=1))
 
@@ -275,5 +275,5 @@ class PointValues:
         closed = (self.paired > 0) & ((self.normal_traction < 0) | tension)
         status = np.where(closed, Status.SLIP, Status.OPEN).astype(np.int8)
         if sticks:
-            status[closed & ~self.slips] = Status.STICK
+            status[closed & ~self.is_slipping] = Status.STICK
         return status

@@ -21,10 +21,10 @@ from fenics_contact.contact.choices import is_regularised
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.markup import html_table
-from fenics_contact.parallel import global_max, global_sum, longest
+from fenics_contact.parallel import global_max, global_sum, max_norm
 from fenics_contact.problem import ContactProblem
 from fenics_contact.surface.displacement import Displacement
-from fenics_contact.surface.mass import assembled, mass_solver
+from fenics_contact.surface.mass import assemble_values, create_mass_solver
 from fenics_contact.surface.surface import PointEvaluator
 from fenics_contact.types import Array
 
@@ -271,7 +271,7 @@ def _displacement(problem: ContactProblem, state: Array) -> float:
     size, work = global_sum(comm, [nodal.sum() + np.abs(on_obstacles).sum(), load @ state])
     if size > 0:
         return float(work / size)
-    return longest(comm, problem.displacement.vectors(state))
+    return max_norm(comm, problem.displacement.vectors(state))
 
 
 # ---- enforcement and solver ----------------------------------------------------------------------
@@ -498,8 +498,8 @@ def _project(
     blocked = fem.functionspace(mesh, ("Lagrange", degree, (len(scalars),)))
     rhs = fem.Function(blocked)
     form = weight * ufl.dot(ufl.as_vector(scalars), ufl.TestFunction(blocked)) * dx
-    assembled(compile_form(form), rhs.x)
-    ksp = mass_solver(mass, rtol=1e-8)
+    assemble_values(compile_form(form), rhs.x)
+    ksp = create_mass_solver(mass, rtol=1e-8)
     component, projections = fem.Function(space), fem.Function(blocked)
     for c in range(len(scalars)):
         component.x.array[:] = rhs.x.array[c :: len(scalars)]

@@ -130,7 +130,7 @@ def increments(
             raise ValueError(f"{name} is {value!r}; it must be a finite number")
     if start == end:
         raise ValueError(f"start and end are both {start!r}; they must differ")
-    ends = _ends(start, end, problem.increments_wanted if steps is None else steps)
+    ends = _ends(start, end, problem.default_increments if steps is None else steps)
     is_interval = isinstance(recover_interior, int | np.integer) and recover_interior >= 1
     if recover_interior not in ("every", "last") and not is_interval:
         raise ValueError(
@@ -217,7 +217,7 @@ def _contact_depends_on(contact: Contact, constant: fem.Constant) -> bool:
     loads = [motion.load() for motion in contact.motions]
     return (
         not is_known
-        or contact.contact_kinematics.data.reads(constant)
+        or contact.contact_kinematics.data.depends_on(constant)
         or any(f is constant for f in loads)
     )
 

@@ -136,7 +136,7 @@ def report(
                 scratch = Path(stack.enter_context(tempfile.TemporaryDirectory()))
                 rows = _collect_rows(problem, steps, csv)
         problem.complete()
-        problem.displacement.follow()
+        problem.displacement.update()
         page = _Page(scratch, units, view, per_thickness=table.is_per_thickness(problem))
         if magnification is None:
             magnification = _choose_magnification(problem)

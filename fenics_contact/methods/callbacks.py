@@ -21,7 +21,7 @@ from fenics_contact.parallel import raise_collectively
 from fenics_contact.systems import dense, linear
 from fenics_contact.types import Array
 
-__all__ = ["Callbacks", "interrupts_held", "release_interrupt"]
+__all__ = ["Callbacks", "defer_interrupts", "release_interrupt"]
 
 
 class _Interrupt:
@@ -36,7 +36,7 @@ def _defer(*arguments: Any) -> None:
 
 
 @contextmanager
-def interrupts_held() -> Iterator[None]:
+def defer_interrupts() -> Iterator[None]:
     """Defer Ctrl-C inside the block, in which PETSc calls Python, until `release_interrupt`."""
     handler = signal.getsignal(signal.SIGINT)
     main = threading.current_thread() is threading.main_thread()
@@ -93,7 +93,7 @@ class Callbacks:
         """
 
         def test(_: Any, iteration: int, norms: tuple[float, float, float]) -> int:
-            not_finite = compat.NOT_FINITE
+            not_finite = compat.DIVERGED_NOT_FINITE
             return (
                 int(self._run(reason, otherwise=not_finite))
                 if np.isfinite(norms[2])
@@ -142,7 +142,7 @@ class Callbacks:
             MemoryError: The factorisation ran out of memory.
         """
         try:
-            with interrupts_held():
+            with defer_interrupts():
                 snes.solve(None, x)
         finally:
             self._last = ()  # the next solution may have other equations

@@ -125,7 +125,12 @@ class Equations:
         ejected = system is self.full and find_ejected_bodies(
             self.full, self.motions, contacts, self.initial_unknowns, self.start
         )
-        if ejected or self._bulk.is_inverted() or system.is_twisted() or system.is_degenerate():
+        if (
+            ejected
+            or self._bulk.is_inverted()
+            or system.is_over_rotated()
+            or system.is_degenerate()
+        ):
             total[:] = np.nan  # a line search takes a shorter step
         self.norms = self.system.norms(total, contacts, self.start)
         # The line search must not follow the round-off of a stiff body. After a restart it is
@@ -266,10 +271,10 @@ class Equations:
         for number, (operator, closing) in enumerate(zip(operators, stiffness, strict=True)):
             contact, group = operator.contact, full.scales.group_of_points(number)
             values, closed = contact.values, contact.status != Status.OPEN
-            slip_ratio = np.where(values.slips, imbalance[group], 0.0)
+            slip_ratio = np.where(values.is_slipping, imbalance[group], 0.0)
             open_ratio = np.where(closing < 1.0, closing, imbalance[group])
             open_ratio[closed | ~modes.is_open[group]] = 0.0
-            tangent = contact.effective_law.tangent().scaled(1.0 - slip_ratio)
+            tangent = contact.effective_law.tangent().scale(1.0 - slip_ratio)
             yield operator.tangent(tangent)
             normal = open_ratio + np.where(closed, slip_ratio, 0.0)
             tangential = np.where(values.friction_bound > 0, 0.0, open_ratio)

@@ -25,7 +25,7 @@ _TOUCHING_GAP_RATIO = 1e-6  # tolerance of the least gap at first touch, by the 
 def set_slip_reference_at_touch(
     full: FullSystem,
     start: Array,
-    end_without: Callable[[Sequence[tuple[Contact, Mask]], Array], Array | None],
+    linearise_end: Callable[[Sequence[tuple[Contact, Mask]], Array], Array | None],
 ) -> Array | None:
     """Set the slip reference of contacts that are apart initially to first touch. Collective.
 
@@ -34,8 +34,8 @@ def set_slip_reference_at_touch(
     Args:
         full: The system on all unknowns.
         start: The state at the start of the increment, with the prescribed values of that time.
-        end_without: Compute the state at the end of the increment with contacts restricted to some
-            of their points; None if nothing else constrains the bodies.
+        linearise_end: Compute the state at the end of the increment with contacts restricted to
+            some of their points; None if nothing else constrains the bodies.
 
     Returns:
         The state at the end if nothing touches; None if something does, or no contact is apart.
@@ -51,7 +51,7 @@ def set_slip_reference_at_touch(
         (p, offset) for p, offset in zip(parts, offsets, strict=True) if p.is_apart(comm, offset)
     ]
     full.set_state(present)
-    end = end_without(_exclude([part for part, _ in apart]), start) if apart else None
+    end = linearise_end(_exclude([part for part, _ in apart]), start) if apart else None
     expected = None
     if end is not None:
         paths = [_Path(full, *pair, start, end) for pair in apart]

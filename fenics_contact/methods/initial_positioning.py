@@ -78,7 +78,7 @@ class InitialPositioning:
     load: Array
     before: Array
 
-    def lead(self, *, first: bool) -> bool:
+    def position_bodies(self, *, first: bool) -> bool:
         """Move unconstrained bodies to a rest position, or to first touch. Collective.
 
         A body released in an earlier increment starts from its present position.
@@ -214,7 +214,7 @@ class InitialPositioning:
         largest = np.abs(load).max()
         gram = global_sum(comm, fields @ fields.T)
         kinematics = [contact.contact_kinematics for contact in self.full.contacts]
-        jumps = [o.displaced_directions(j) for o, j in zip(kinematics, jumps, strict=True)]
+        jumps = [o.rotate_to_displaced(j) for o, j in zip(kinematics, jumps, strict=True)]
         return _FreeModes(modes, load / largest, gram, jumps) if largest > 0 else None
 
     def _displace(self, modes: Index, coefficients: Array) -> None:

@@ -52,7 +52,7 @@ class Overload:
         """Load by resistance; infinite without resistance."""
         return self.load / self.resistance if self.resistance > 0 else np.inf
 
-    def in_words(self) -> str:
+    def describe(self) -> str:
         """Describe the overload for log and errors."""
         return (
             f"overload: along the {self.motion} the load is {self.load:.4g}, but friction under "
@@ -111,7 +111,7 @@ def _find_worst(
     finite = all(
         np.isfinite(v).all()
         for c in frictional
-        for v in (c.values.bound_of_law, c.values.circumradius)
+        for v in (c.values.law_friction_bound, c.values.circumradius)
     )
     if not comm.allreduce(finite, op=MPI.LAND):  # unknown bounds, or a diverged state
         return None
@@ -124,7 +124,7 @@ def _find_worst(
         if contact.law.has_friction:
             tangential = modes - normal_part[:, :, None] * normal
             # Open points may close: they have the bound of the law at zero pressure.
-            bound = contact.values.bound_of_law * contact.values.circumradius
+            bound = contact.values.law_friction_bound * contact.values.circumradius
             sliding.append((tangential, contact.measure * bound))
     closing = np.concatenate(approaching or [np.zeros((len(load), 0))], axis=1)
 

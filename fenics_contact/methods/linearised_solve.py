@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 from petsc4py import PETSc
 
-from fenics_contact.methods.callbacks import interrupts_held
+from fenics_contact.methods.callbacks import defer_interrupts
 from fenics_contact.methods.equations import Equations
 from fenics_contact.systems import dense, linear
 from fenics_contact.types import Array
@@ -54,7 +54,7 @@ def linearised_solver(
                 operator.add_force(rhs, traction)
         rhs.array[system.constrained] = 0.0
         rhs.scale(-1.0 / system.bulk.scale)
-        with interrupts_held():
+        with defer_interrupts():
             ksp.solve(rhs, solution)
         dense.raise_stored_error(ksp)
         if ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:

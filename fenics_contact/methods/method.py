@@ -246,7 +246,7 @@ class Newton(SnesMethod):
             "snes_type": "newtonls",
             "snes_stol": 0.0,
             "snes_max_it": 100,
-            compat.LONGEST_STEP: 100.0,
+            compat.MAX_STEP_OPTION: 100.0,
             "snes_linesearch_type": "bt",
             "snes_linesearch_order": 1,
             "snes_linesearch_alpha": 0.0,

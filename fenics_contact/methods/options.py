@@ -87,7 +87,7 @@ class Defaults:
         self._caller_keys |= names
         self._unused |= names
 
-    def warn_of_unread(self, prefix: str) -> None:
+    def warn_of_unused(self, prefix: str) -> None:
         """Warn once of options, of the caller or the database, that no solver has read."""
         if self._has_warned or not prefix:
             return
@@ -96,7 +96,7 @@ class Defaults:
         for name in PETSc.Options().getAll():
             if name.startswith(prefix):
                 unused.discard(name)
-                if not compat.option_was_read(name):
+                if not compat.is_option_used(name):
                     unused.add(name)
         names = [f"-{name}" for name in sorted(unused) if not _READ_LATE.search(name, len(prefix))]
         if names:
@@ -152,6 +152,6 @@ class Defaults:
             yield
         finally:
             for key in added:
-                if key in self._unused and compat.option_was_read(key):
+                if key in self._unused and compat.is_option_used(key):
                     self._unused.remove(key)
                 database.delValue(key)

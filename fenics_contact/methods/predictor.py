@@ -57,7 +57,7 @@ class Predictor:
         self._prescribed_change: Array | None = None  # change of the prescribed values
         self._converged: list[_ConvergedContact] = []  # of the last solution
 
-    def moved_from(self, before: Array) -> None:
+    def store_prescribed_change(self, before: Array) -> None:
         """Store the change of prescribed values since ``before``, of a nonlinear bulk. Collective.
 
         ``before`` is the state of the full system at the end of the last increment.
@@ -283,7 +283,7 @@ class Predictor:
             if contact.rigid:
                 # A moved obstacle displaces sticking points, and rotates tractions.
                 values = contact.states.evaluate_present()
-                offset = kinematics.turned(converged.values.jump - values.jump)
+                offset = kinematics.rotate(converged.values.jump - values.jump)
                 length = np.linalg.norm(offset, axis=1) / scales.size_at_points(number)
                 moved = moved or global_max(comm, length) > NEGLIGIBLE
                 rotation = kinematics.angle(converged.values) - kinematics.angle(values)

@@ -262,7 +262,7 @@ class _Springs:
         normal = values.normal_stiffness * values.gap - values.multiplier
         sticking = values.old_traction - _multiply(values.tangential_stiffness, values.increment)
         normal_excess = np.where(values.normal_traction < 0, 0.0, normal)
-        sticks = (values.friction_bound > 0) & ~values.slips
+        sticks = (values.friction_bound > 0) & ~values.is_slipping
         slip_excess = np.where(sticks[:, None], 0.0, values.tangential(sticking - values.traction))
         n = values.normal
         return normal[:, None] * n + sticking, normal_excess[:, None] * n + slip_excess

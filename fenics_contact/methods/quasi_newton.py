@@ -80,7 +80,7 @@ class QuasiNewton(SnesMethod):
         best, best_solution = np.inf, solution.copy()
         while True:
             remaining = limit - iterations
-            snes.setTolerances(max_it=min(equations.system.iterations_per_round, remaining))
+            snes.setTolerances(max_it=min(equations.system.iterations_per_restart, remaining))
             iterations += self._callbacks.solve(snes, solution)[0]
             residual = equations.residual(solution, equations.function).total
             if equations.solved():
@@ -96,10 +96,12 @@ class QuasiNewton(SnesMethod):
                     best_solution.copy(solution)
             if stalls >= _MAX_STALLS:
                 diverged = not np.isfinite(residual)
-                failure = compat.NOT_FINITE if diverged else int(_REASONS.DIVERGED_LINE_SEARCH)
+                failure = (
+                    compat.DIVERGED_NOT_FINITE if diverged else int(_REASONS.DIVERGED_LINE_SEARCH)
+                )
                 return iterations, failure
             if not self._assemble_h0():
-                return iterations, compat.NOT_FINITE
+                return iterations, compat.DIVERGED_NOT_FINITE
             stalled = stalls >= _MAX_OVERLOAD_STALLS and self.can_hand_over()
             if stalled and equations.find_overload() is not None:
                 return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fenics_contact.systems.candidate_dofs import active_points, distances, nearest, touched
-from fenics_contact.systems.condensed import all_retained, inexpensive, worthwhile
+from fenics_contact.systems.condensed import is_worthwhile, n_inexpensive, should_retain_all
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.tolerances import NEGLIGIBLE
@@ -59,7 +59,9 @@ class RetainedDofs:
         return int(self._full.unknowns.comm.allreduce(indices.size))
 
     def _is_small(self, coupled: Indices) -> bool:
-        return all_retained(self._full.unknowns.n_global, self._count(coupled), self._full.gdim)
+        return should_retain_all(
+            self._full.unknowns.n_global, self._count(coupled), self._full.gdim
+        )
 
     def _select_nearest(self, at_least: int = 0, gaps: Sequence[Array] | None = None) -> Indices:
         """Select about ``at_least`` unknowns of the points with the least gaps. Collective."""
@@ -69,12 +71,12 @@ class RetainedDofs:
         if gaps is None:
             self._full.evaluate()
             gaps = [distances(contact) for contact in self._full.contacts]
-        n_inexpensive = inexpensive(self._full.unknowns.n_global, self._full.gdim)
+        n_cheap = n_inexpensive(self._full.unknowns.n_global, self._full.gdim)
         return nearest(
             self._full.operators,
             self._full.unknowns,
             gaps,
-            max(at_least, n_inexpensive),
+            max(at_least, n_cheap),
             NEGLIGIBLE * self._full.scales.mesh_size,
         )
 
@@ -91,7 +93,7 @@ class RetainedDofs:
         return self._select_nearest(0, gaps) if can_drop else retained
 
     def _is_worthwhile(self, retained: Indices) -> bool:
-        return worthwhile(self._full.unknowns.n_global, self._count(retained), self._full.gdim)
+        return is_worthwhile(self._full.unknowns.n_global, self._count(retained), self._full.gdim)
 
     def extend(self) -> bool:
         """Add all unknowns coupled by new pairs if they are few. Collective.

@@ -59,7 +59,7 @@ _SNES_TYPES = (*_NEWTONS, "qn", "nrichardson", "ngmres", "ncg", "anderson")
 _REASONS = PETSc.SNES.ConvergedReason
 _OUTCOMES = {
     int(_REASONS.DIVERGED_LINEAR_SOLVE): "the matrix is singular",
-    compat.NOT_FINITE: "the residual is not finite",
+    compat.DIVERGED_NOT_FINITE: "the residual is not finite",
     int(_REASONS.DIVERGED_MAX_IT): "iteration limit reached",
     int(_REASONS.DIVERGED_LINE_SEARCH): "no progress",
     int(_REASONS.DIVERGED_DTOL): "no progress",
@@ -74,7 +74,7 @@ _COMMON: dict[str, Any] = {
     "snes_linesearch_rtol": 0.1,
     "snes_linesearch_max_it": 20,
     # After initial positioning no step needs to be long.
-    compat.LONGEST_STEP: 100.0,
+    compat.MAX_STEP_OPTION: 100.0,
     # `cp` takes |F·y| below this for convergence of SNES; the residual itself is tested here.
     "snes_linesearch_atol": 1e-300,
 }
@@ -260,7 +260,7 @@ class Solver:
             asked_for.check()
         equations.rtol = snes.getTolerances()[0]
 
-    def expect(self, increments: int) -> None:
+    def set_expected_increments(self, increments: int) -> None:
         """Configure for a number of increments, before the first is solved. Collective."""
         if self.expected_increments != increments:
             self.expected_increments = increments
@@ -365,28 +365,28 @@ class Solver:
         Args:
             found: Whether there is a solution, with contacts evaluated on all of Γc.
         """
-        if not self.system.confined:
+        if not self.system.is_restricted:
             return False
         required = self._retained.needs_more_dofs(self.system.operators, has_solution=found)
         # Only the full system may have an equilibrium of a body that only contact constrains.
         return required or (not found and len(self.equations.motions.free) > 0)
 
-    def change(self, *, anew: bool) -> None:
+    def change_dofs(self, *, can_drop: bool) -> None:
         """Retain other unknowns, or solve the full system if that is cheaper. Collective.
 
         The state is that at the start of the increment.
 
         Args:
-            anew: Whether the retained unknowns may be dropped if there are too many.
+            can_drop: Whether the retained unknowns may be dropped if there are too many.
         """
-        self._retained.update(can_drop=anew)
+        self._retained.update(can_drop=can_drop)
         if self._choose_condensation() != self.condensed:
             self._reconfigure()
         elif self.condensed:
             self._set_system()
             self._reset_matrices()
 
-    def keep(self, retained: Indices) -> None:
+    def retain_dofs(self, retained: Indices) -> None:
         """Retain the unknowns of another run, all if it had no condensation. Collective."""
         is_condensed = self._comm.allreduce(retained.size) > 0
         switch = is_condensed != self.condensed and self._settings.condensation is None
@@ -519,7 +519,7 @@ class Solver:
         if reason > 0:
             return "converged"
         if (overload := self.equations.overload) is not None:
-            return overload.in_words()
+            return overload.describe()
         description = _OUTCOMES.get(reason, f"SNES reason {reason}")
         return "; ".join(filter(None, (description, self.equations.monitor.describe_chattering())))
 
@@ -540,14 +540,14 @@ class Solver:
     ) -> AbstractContextManager[Callable[[Sequence[Array] | None], Array]]:
         """Linearise the equations at a complete state (`ContactProblem.linearised`). Collective."""
         if self.select_dofs():
-            self.change(anew=True)
+            self.change_dofs(can_drop=True)
         # Nothing is assembled after a restart at the end of a history.
         self.update_system(self._full.update_stiffness())
         self.predictor.invalidate_tangent()
         self.system.begin(load)
         return linearised_solver(self.equations, springs)
 
-    def end_without(self, acting: Sequence[tuple[Contact, Mask]], start: Array) -> Array | None:
+    def linearise_end(self, acting: Sequence[tuple[Contact, Mask]], start: Array) -> Array | None:
         """Linearise the end of the increment with contacts restricted to some points. Collective.
 
         All other points that are closed in ``start`` stick.

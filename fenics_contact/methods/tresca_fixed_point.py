@@ -126,7 +126,7 @@ class TrescaFixedPoint(StandaloneMethod):
 
     def check(self) -> None:
         """Check that the problem with a given friction bound has a potential."""
-        if self._equations.full.displacement.mixed:
+        if self._equations.full.displacement.is_mixed:
             raise ValueError(
                 "method is 'alternating', but u is a part of a mixed function, whose equations are "
                 "a saddle-point problem, not a minimisation; use another method"
@@ -145,7 +145,7 @@ class TrescaFixedPoint(StandaloneMethod):
     @property
     def suits(self) -> bool:
         """Whether the method applies to the problem."""
-        mixed = self._equations.full.displacement.mixed
+        mixed = self._equations.full.displacement.is_mixed
         return bool(self._equations.contacts) and not mixed and not self._without_potential()
 
     def _without_potential(self) -> list[Contact]:

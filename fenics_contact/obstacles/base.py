@@ -18,7 +18,7 @@ from fenics_contact.arguments import check_positive, is_built_in, is_number
 from fenics_contact.types import Array
 
 __all__ = [
-    "NOWHERE",
+    "MAX_COORDINATE",
     "Motion",
     "Obstacle",
     "Placement",
@@ -35,7 +35,7 @@ __all__ = [
 ToUFL = Callable[[Any], ufl.core.expr.Expr]
 
 # Largest coordinate at which obstacles are evaluated; points of diverged states may be beyond.
-NOWHERE = 1e100
+MAX_COORDINATE = 1e100
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class Rotation:
         skew = ufl.as_matrix([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         return ufl.Identity(3) + s * skew + (1 - c) * ufl.dot(skew, skew)
 
-    def turned(self, vectors: Array, angle: float | Array) -> Array:
+    def rotate(self, vectors: Array, angle: float | Array) -> Array:
         """Rotate vectors (n, gdim) by one angle, or by one angle each (radians)."""
         c, s = (np.reshape(f(angle), (-1, 1)) for f in (np.cos, np.sin))
         if self.axis is None:
@@ -322,14 +322,14 @@ class SampledObstacle(Obstacle):
         raise NotImplementedError
 
     def sample_checked(self, x: Array) -> Sample:
-        """Return `sample` after checking shapes and values; NaN beyond `NOWHERE`.
+        """Return `sample` after checking shapes and values; NaN beyond `MAX_COORDINATE`.
 
         Not collective.
 
         Raises:
             ValueError: An array has the wrong shape, or a distance or normal is not finite.
         """
-        valid = np.abs(x).max(axis=1, initial=0.0) < NOWHERE
+        valid = np.abs(x).max(axis=1, initial=0.0) < MAX_COORDINATE
         given = self.sample(x[valid])
         d, name = x.shape[1], type(self).__name__
         n = int(np.count_nonzero(valid))

@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import gather_on_first
+from fenics_contact.parallel import gather_on_root
 from fenics_contact.surface.facets import FacetSet
-from fenics_contact.tolerances import by_place
+from fenics_contact.tolerances import sort_by_coordinates
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Along", "along"]
@@ -63,9 +63,9 @@ def along(contact: Contact, unit: str = "mm") -> Along | None:
         "slip": contact.slip.sum(axis=1),
         "status": contact.status,
     }
-    parts = gather_on_first(
+    parts = gather_on_root(
         contact.surface.mesh.comm,
-        facets.moved_corners(None),
+        facets.displaced_corners(None),
         facets.corner_vertices(),
         facets.mean_normals(),
         contact.quadrature.weights[rows].sum(axis=1),
@@ -129,7 +129,7 @@ def _chains(vertices: Index, ends: Array) -> list[tuple[Index, bool]]:
 
     Facets have first and last vertices (n_facets, 2) with coordinates (n_facets, 2, 2).
     """
-    order = by_place(ends[:, 0])
+    order = sort_by_coordinates(ends[:, 0])
     leaving: dict[int, list[int]] = {}
     for facet in order[::-1]:
         leaving.setdefault(int(vertices[facet, 0]), []).append(int(facet))

@@ -113,7 +113,7 @@ class Animation:
         else:
             raise ValueError(f"state is {state!r}; it must be a Step, or a title (str)")
         self._problem.complete()
-        self._problem.displacement.follow()
+        self._problem.displacement.update()
         shape, ends, status = self._shape(), [], []
         if self._problem.displacement.u.function_space.mesh.topology.dim == 2:
             for contact in self._problem.contacts:

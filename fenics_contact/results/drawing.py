@@ -18,7 +18,7 @@ from fenics_contact.arguments import check_instance, check_positive, is_number
 from fenics_contact.compiling import compile_expression
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import gather_on_first, global_sum
+from fenics_contact.parallel import gather_on_root, global_sum
 from fenics_contact.results import files
 from fenics_contact.results.obstacles import ObstacleShape, box_about, shapes_of
 from fenics_contact.surface.facets import FacetSet
@@ -152,8 +152,8 @@ class ShapeEvaluator:
         """Return the shape on the first rank, None on the others. Collective."""
         mesh = self._u.function_space.mesh
         if self._dim == 3:
-            original = self._facets.moved_corners(None)
-            displacement = self._facets.moved_corners(self._u) - original
+            original = self._facets.displaced_corners(None)
+            displacement = self._facets.displaced_corners(self._u) - original
         else:
             self._at_corners.interpolate(self._u)
             original = self._vertices[self._corners]
@@ -162,7 +162,7 @@ class ShapeEvaluator:
         if self._stress is not None and len(self._cells):
             values = np.asarray(self._stress.eval(mesh, self._cells))
             stress = von_mises(values.reshape(-1, 3, 3))
-        gathered = gather_on_first(mesh.comm, original, displacement, stress)
+        gathered = gather_on_root(mesh.comm, original, displacement, stress)
         if gathered is None:
             return None
         original, displacement, stress = gathered
@@ -235,14 +235,14 @@ def gather_surface(
     contact: Contact, values: npt.NDArray[Any], magnification: float
 ) -> Surface | None:
     """Gather Γc with a value per facet on the first rank; None on the others. Collective."""
-    contact.displacement.follow()
+    contact.displacement.update()
     u, mesh = contact.displacement.u, contact.surface.mesh
     outward = global_sum(
         mesh.comm, FacetSet(u.function_space, contact.surface.facets).mean_normals().sum(axis=0)
     )
     shape = ShapeEvaluator(u)()
     status = contact.status[contact.quadrature.point_rows]
-    in_contact = gather_on_first(mesh.comm, np.any(status != Status.OPEN, axis=1))
+    in_contact = gather_on_root(mesh.comm, np.any(status != Status.OPEN, axis=1))
     gathered = gather_facets(contact, values)
     if gathered is None or in_contact is None or shape is None:
         return None
@@ -260,9 +260,9 @@ def gather_facets(
     """
     u = contact.displacement.u
     facets = FacetSet(u.function_space, contact.surface.facets)
-    original = facets.moved_corners(None)
-    local = original, facets.moved_corners(u) - original, values
-    gathered = gather_on_first(contact.surface.mesh.comm, *local)
+    original = facets.displaced_corners(None)
+    local = original, facets.displaced_corners(u) - original, values
+    gathered = gather_on_root(contact.surface.mesh.comm, *local)
     if gathered is None:
         return None
     original, displacement, values = gathered

@@ -20,7 +20,7 @@ from fenics_contact.arguments import check_instance, is_number
 from fenics_contact.compiling import compile_expression
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
-from fenics_contact.parallel import collective_errors, gather_on_first
+from fenics_contact.parallel import collective_errors, gather_on_root
 from fenics_contact.problem import ContactProblem
 from fenics_contact.results import files, vtu
 from fenics_contact.results.drawing import von_mises
@@ -256,7 +256,7 @@ class _Surface:
     def grids(self) -> tuple[vtu.Grid, vtu.Grid]:
         """Return the present grids of this rank's facets and points. Collective."""
         contact, rows = self._contact, self._rows
-        contact.displacement.follow()
+        contact.displacement.update()
         x, _ = self._facets.positions(*self._nodes)
         x_deformed, _ = self._facets.positions(*self._nodes, self._u)
         nodes = x.reshape(self._shape)
@@ -303,7 +303,7 @@ def facet_status(contact: Contact) -> npt.NDArray[np.int8]:
 def _gather(comm: MPI.Comm, grid: vtu.Grid) -> vtu.Grid:
     """Return the grid of all ranks on the first one, this rank's on the others. Collective."""
     rows = grid.points, *grid.at_nodes.values(), *grid.in_cells.values()
-    gathered = gather_on_first(comm, *rows)
+    gathered = gather_on_root(comm, *rows)
     if gathered is None:
         return grid
     points, *fields = gathered

@@ -8,7 +8,7 @@ import scipy.sparse.csgraph
 from dolfinx import fem
 from mpi4py import MPI
 
-from fenics_contact.tolerances import by_place
+from fenics_contact.tolerances import sort_by_coordinates
 
 __all__ = ["connected_bodies"]
 
@@ -61,5 +61,5 @@ def _renumber(space: fem.FunctionSpace, n: int, body: npt.NDArray[np.intp]) -> n
     space.mesh.comm.Allreduce(MPI.IN_PLACE, corners, op=MPI.MIN)
     keys = np.concatenate([corners[0], -corners[1]], axis=1)
     number = np.empty(n, dtype=np.intp)
-    number[by_place(keys)] = np.arange(n)
+    number[sort_by_coordinates(keys)] = np.arange(n)
     return number[body]

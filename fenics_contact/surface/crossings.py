@@ -15,7 +15,7 @@ from fenics_contact.surface.projection import find_near_pairs
 from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["Crossings", "MovingFacets", "find_crossings", "largest_depth_on_path"]
+__all__ = ["Crossings", "MovingFacets", "find_crossings", "max_penetration_on_path"]
 
 _BISECTION_STEPS = 40
 _MAX_PATH_SAMPLES = 1000
@@ -99,7 +99,7 @@ def find_crossings(
     return Crossings(number[order], time, inward, normal, depth, found[:, -1].astype(np.int64))
 
 
-def largest_depth_on_path(
+def max_penetration_on_path(
     comm: Any, start: Array, end: Array, since: Array, vertices: Index, facets: MovingFacets
 ) -> Array:
     """Return the largest penetration depth of this rank's points on their paths. Collective.

@@ -64,7 +64,7 @@ class Displacement:
             self.u = fem.Function(space, name="u")
             before = ufl.split(self.whole)[: self._part]
             self.first = sum(int(np.prod(part.ufl_shape, dtype=int)) for part in before)
-            self.follow()
+            self.update()
         self.degree = _degree(self.u, mesh or self.u.function_space.mesh, name)
 
     @classmethod
@@ -90,7 +90,7 @@ class Displacement:
         return found[0]
 
     @property
-    def mixed(self) -> bool:
+    def is_mixed(self) -> bool:
         """Whether the displacement is a part of a mixed function."""
         return self.dofs is not None
 
@@ -99,7 +99,7 @@ class Displacement:
         """Number of dofs of ``u`` owned by this rank."""
         return _n_owned(self.u)
 
-    def same_part(self, other: Displacement) -> bool:
+    def is_same_part(self, other: Displacement) -> bool:
         """Return whether another displacement is the same part of the same function."""
         return self.whole is other.whole and self._part == other._part
 
@@ -119,7 +119,7 @@ class Displacement:
             seen.add(item)
         return False
 
-    def follow(self) -> None:
+    def update(self) -> None:
         """Copy the present values of ``whole`` to ``u``."""
         if self.dofs is not None:
             self.u.x.array[:] = self.whole.x.array[self.dofs]
@@ -137,7 +137,7 @@ class Displacement:
         owned = np.arange(self.n_owned) if self.dofs is None else self.dofs[: self.n_owned]
         return np.asarray(values[owned]).reshape(-1, self.u.function_space.dofmap.bs)
 
-    def lifted(self, matrix: PETSc.Mat) -> PETSc.Mat:
+    def expand_columns(self, matrix: PETSc.Mat) -> PETSc.Mat:
         """Map the columns of a matrix from the dofs of ``u`` to those of ``whole``. Collective.
 
         The matrix itself is returned if these are the same.

@@ -139,7 +139,7 @@ class FacetSet:
         outward = self.outward[facet, None] * across(tangents)
         return np.asarray(outward / np.linalg.norm(outward, axis=1, keepdims=True))
 
-    def moved_corners(self, u: fem.Function | None) -> Array:
+    def displaced_corners(self, u: fem.Function | None) -> Array:
         """Return the corners displaced by ``u``, (n_facets, n_corners, d)."""
         corners, _ = self.positions(*self.combine(self._corners), u)
         return corners.reshape(len(self.cells), len(self._corners), self._d)
@@ -147,7 +147,7 @@ class FacetSet:
     def bounding_balls(self, u: fem.Function | None) -> tuple[Array, Array]:
         """Return bounding balls of the displaced facets: centres, (n_facets, d), and radii."""
         middle, _ = self.positions(*self.combine(self._middle), u)
-        arms = np.linalg.norm(self.moved_corners(u) - middle[:, None], axis=2)
+        arms = np.linalg.norm(self.displaced_corners(u) - middle[:, None], axis=2)
         return middle, _CURVED_RADIUS_RATIO * arms.max(axis=1, initial=0.0)
 
     def mean_normals(self) -> Array:

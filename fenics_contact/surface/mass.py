@@ -8,10 +8,10 @@ from petsc4py import PETSc
 from fenics_contact.parallel import collective_errors
 from fenics_contact.types import Array
 
-__all__ = ["assembled", "mass_solver"]
+__all__ = ["assemble_values", "create_mass_solver"]
 
 
-def assembled(form: fem.Form, vector: la.Vector | None = None) -> Array:
+def assemble_values(form: fem.Form, vector: la.Vector | None = None) -> Array:
     """Assemble a form, in ``vector`` if given, and return its values, with ghosts. Collective."""
     with collective_errors(form.mesh.comm):
         if vector is None:
@@ -24,7 +24,7 @@ def assembled(form: fem.Form, vector: la.Vector | None = None) -> Array:
     return vector.array
 
 
-def mass_solver(
+def create_mass_solver(
     matrix: PETSc.Mat, *, rtol: float, atol: float | None = None, max_it: int | None = None
 ) -> PETSc.KSP:
     """Create a Jacobi-preconditioned conjugate gradient solver for a mass matrix. Collective.

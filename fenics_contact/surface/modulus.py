@@ -12,11 +12,11 @@ import ufl
 from dolfinx import fem
 
 from fenics_contact import compat
-from fenics_contact.compiling import compile_by_rule, compile_form
+from fenics_contact.compiling import compile_by_quadrature_rule, compile_form
 from fenics_contact.parallel import global_max, global_min
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_cells
-from fenics_contact.surface.mass import assembled, mass_solver
+from fenics_contact.surface.mass import assemble_values, create_mass_solver
 from fenics_contact.surface.surface import ContactSurface
 from fenics_contact.types import Array, Indices
 
@@ -62,11 +62,15 @@ def cell_modulus(
     if probes.empty():
         return modulus
     # A separate form: the subdomain data of the bulk form exclude other measures.
-    volume = assembled(compile_form(weight * ufl.TestFunction(modulus.function_space) * ufl.dx))
-    energies = np.sum([assembled(part) for part in compile_by_rule(probes)], axis=0)
+    volume = assemble_values(
+        compile_form(weight * ufl.TestFunction(modulus.function_space) * ufl.dx)
+    )
+    energies = np.sum(
+        [assemble_values(part) for part in compile_by_quadrature_rule(probes)], axis=0
+    )
     shear, stretch = energies.reshape(-1, 2).T / volume
     isotropic = stretch > 1.2 * shear  # λ > -0.8 G, as in all isotropic solids
-    if displacement.mixed:
+    if displacement.is_mixed:
         modulus.x.array[:] = 3 * shear
         return modulus
     modulus.x.array[:] = stretch
@@ -151,8 +155,8 @@ def _smooth(values: fem.Function, length: fem.Function) -> fem.Function:
     matrix.assemble()
     result = fem.Function(space, name="modulus_over_height")
     rhs = fem.Function(space)
-    assembled(compile_form(values * v * dx), rhs.x)
-    ksp = mass_solver(matrix, rtol=1e-14, max_it=10_000)
+    assemble_values(compile_form(values * v * dx), rhs.x)
+    ksp = create_mass_solver(matrix, rtol=1e-14, max_it=10_000)
     ksp.solve(rhs.x.petsc_vec, result.x.petsc_vec)
     result.x.scatter_forward()
     ksp.destroy()

@@ -20,7 +20,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from fenics_contact.compat import sparse_matrix
+from fenics_contact.compat import create_csr_matrix
 from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import collective_errors, gather_rows, global_max, global_mean
 from fenics_contact.surface.facets import tabulate
@@ -85,8 +85,8 @@ class Pairing:
         self._obstacle, self._quadrature = obstacle, quadrature
         self.round_off = _COORDINATE_ROUND_OFF * global_max(mesh.comm, np.abs(mesh.geometry.x))
         self.rays = rays = Rays(obstacle, quadrature, space)
-        self._slave, self._master = rays.here.facets, rays.there.facets
-        self._sides, self._facet, self._space = (rays.here, rays.there), rays.facet, space
+        self._slave, self._master = rays.slave.facets, rays.master.facets
+        self._sides, self._facet, self._space = (rays.slave, rays.master), rays.facet, space
         self._xi: Array | None = None
         self._hits: PresentHits | None = None
 
@@ -112,7 +112,7 @@ class Pairing:
             hits, start = self.at_rest(xi, x, normal)
             penetration_bound = np.maximum(penetration_bound, start)
         else:
-            hits = self.rays.follow(self._facet, xi, normal, u, penetration_bound)
+            hits = self.rays.trace(self._facet, xi, normal, u, penetration_bound)
         paired = ~np.isnan(hits.distance)
         gap = np.einsum("qd,qd->q", hits.place - x, normal)
         gap[np.abs(gap) <= self.round_off] = 0.0
@@ -120,7 +120,7 @@ class Pairing:
         np.maximum.at(distance, self._facet[paired], np.abs(hits.distance[paired]))
         facet, other, points, weights, fraction = self._cut_facets(u, distance)
         ray = self._slave.normals(facet, points)
-        segments = self.rays.follow(facet, points, ray, u, penetration_bound)
+        segments = self.rays.trace(facet, points, ray, u, penetration_bound)
         facet = self._drop_false_segments(facet, other, fraction, segments.facet)
         # Facets that are not covered, or have unpaired points, use interpolation at their points.
         cut = facet >= 0
@@ -145,14 +145,14 @@ class Pairing:
             Hits, and the initial penetration at each of all facets of Γc (length).
         """
         zero = np.zeros(len(self._sides[0].body))
-        hits = self.rays.follow(self._facet, xi, normal, None, zero)
+        hits = self.rays.trace(self._facet, xi, normal, None, zero)
         if self._obstacle.max_initial_penetration is None:
             inside = self._points_inside(x, hits.reason == BEHIND)
             if self._comm.allreduce(np.count_nonzero(inside)):
                 penetration_bound = zero.copy()
                 penetration_bound[self._sides[0].first + self._facet[inside]] = np.inf
                 self._comm.Allreduce(MPI.IN_PLACE, penetration_bound, op=MPI.MAX)
-                hits = self.rays.follow(self._facet, xi, normal, None, penetration_bound)
+                hits = self.rays.trace(self._facet, xi, normal, None, penetration_bound)
         return hits, self.largest(np.nan_to_num(-hits.distance))
 
     def largest(self, values: Array) -> Array:
@@ -161,7 +161,7 @@ class Pairing:
         np.maximum.at(largest, self._facet, values)
         return np.concatenate(self._comm.allgather(largest))
 
-    def nearby(
+    def find_candidate_facets(
         self, u: fem.Function, before: fem.Function | None, depth: float
     ) -> tuple[Index, Index]:
         """Find local facets of both sides that may penetrate or have crossed others. Collective.
@@ -199,10 +199,10 @@ class Pairing:
             Gaps, (n_points,) (length), NaN if unpaired; unit normals, (n_points, d).
         """
         n = len(self.located(x))
-        found = self.present_hits(x, u, penetration)
+        found = self.trace_present(x, u, penetration)
         return found.hits.distance[:n], found.normal[:n].copy()
 
-    def present_hits(
+    def trace_present(
         self, x: Array, u: fem.Function, penetration: Array, facets: Index | None = None
     ) -> PresentHits:
         """Trace the present normals of Γc at the points and on the lattice of facets. Collective.
@@ -222,7 +222,7 @@ class Pairing:
             normal = self._slave.normals(facet, reference, u)
             undeformed = self._slave.normals(facet, reference)
             penetration_bound = self.largest(penetration)
-            hits = self.rays.follow(
+            hits = self.rays.trace(
                 facet, reference, normal, u, penetration_bound, undeformed=undeformed, before=u
             )
             present = PresentHits(u.x.array.copy(), facets, facet, reference, normal, hits)
@@ -305,7 +305,7 @@ class Pairing:
         )
         local = scipy.sparse.kron(local, np.eye(d), format="csr")
         first = self._comm.scan(m * d) - m * d
-        return sparse_matrix(self._comm, m * d, local.indptr, local.indices + first, local.data)
+        return create_csr_matrix(self._comm, m * d, local.indptr, local.indices + first, local.data)
 
     def _cut_facets(
         self, u: fem.Function | None, distance: Array
@@ -324,7 +324,7 @@ class Pairing:
             weight, (m,); weight as a fraction of the facet's area, (m,).
         """
         slave, d = self._slave, self._d
-        slave_corners, local_corners = slave.moved_corners(u), self._master.moved_corners(u)
+        slave_corners, local_corners = slave.displaced_corners(u), self._master.displaced_corners(u)
         master_corners = gather_rows(self._comm, local_corners)
         master_normal = gather_rows(self._comm, self._master.mean_normals())
         normal = slave.mean_normals()

@@ -16,7 +16,7 @@ from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.facets import FacetSet
 from fenics_contact.surface.projection import find_near_pairs
 from fenics_contact.surface.rays import Side
-from fenics_contact.tolerances import FLAT, NEGLIGIBLE, by_place
+from fenics_contact.tolerances import FLAT, NEGLIGIBLE, sort_by_coordinates
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Neighbours", "find_neighbours"]
@@ -90,12 +90,12 @@ def find_neighbours(
     """
     comm, label = space.mesh.comm, np.asarray(label, dtype=np.int64)
     if not self_contact:
-        corners = FacetSet(space, facets).moved_corners(None)
+        corners = FacetSet(space, facets).displaced_corners(None)
         near = _is_near_other_body(comm, corners, label, distance)
         facets, label = facets[near], label[near]
     own = FacetSet(space, facets)
     side = Side(own, connected_bodies(space)[1])
-    corners = gather_rows(comm, own.moved_corners(None))
+    corners = gather_rows(comm, own.displaced_corners(None))
     normal, label = gather_rows(comm, own.mean_normals()), np.concatenate(comm.allgather(label))
     arms = np.linalg.norm(corners - side.middle[:, None], axis=2)
     surface = _Facets(side, corners, normal, label, arms.max(axis=1, initial=0.0))
@@ -204,7 +204,7 @@ def _divide_sides(pairs: Index, middle: Array, *, same: bool) -> tuple[Index, In
     graph = scipy.sparse.coo_matrix((ones, number.T), (len(candidates), len(candidates))).tocsr()
     side = np.full(len(candidates), -1)
     _, group = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    in_order = by_place(middle[candidates])
+    in_order = sort_by_coordinates(middle[candidates])
     _, first = np.unique(group[in_order], return_index=True)
     for start in in_order[first]:
         order, parent = scipy.sparse.csgraph.breadth_first_order(graph, start, directed=False)

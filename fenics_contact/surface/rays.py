@@ -15,7 +15,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from fenics_contact.compat import sparse_matrix
+from fenics_contact.compat import create_csr_matrix
 from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import gather_rows
 from fenics_contact.surface.bodies import connected_bodies
@@ -65,7 +65,7 @@ class Side:
     def __init__(self, facets: FacetSet, body: Any) -> None:
         comm = facets.space.mesh.comm
         self.facets = facets
-        corners = facets.moved_corners(None)
+        corners = facets.displaced_corners(None)
         between = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=3)
         ranks = comm.allgather(
             (
@@ -93,7 +93,7 @@ class Side:
         facets = self.facets
         comm, d = facets.space.mesh.comm, facets.space.mesh.topology.dim
         facet, xi = facets.corners()
-        corners = facets.moved_corners(None)
+        corners = facets.displaced_corners(None)
         n, n_corners = corners.shape[:2]
         normal = facets.normals(facet, xi).reshape(n, n_corners + 1, d)[:, :-1]
         size = np.linalg.norm(corners - corners.mean(axis=1)[:, None], axis=2).max(axis=1)
@@ -258,13 +258,13 @@ class Rays:
         self._obstacle = obstacle
         opposite = tagged_facets(mesh, obstacle.facet_tags, obstacle.tags)
         _, self.body = connected_bodies(space)
-        self.here = Side(FacetSet(space, quadrature.surface.facets), self.body)
-        self.there = Side(FacetSet(space, opposite), self.body)
+        self.slave = Side(FacetSet(space, quadrature.surface.facets), self.body)
+        self.master = Side(FacetSet(space, opposite), self.body)
         rows = quadrature.point_rows
         self.facet = np.empty(quadrature.n_points, dtype=np.int64)
         self.facet[rows.ravel()] = np.repeat(np.arange(len(rows)), rows.shape[1])
 
-    def follow(
+    def trace(
         self,
         facet: Index,
         xi: Array,
@@ -289,7 +289,7 @@ class Rays:
             before: Earlier displacement at which the hits are evaluated, too.
         """
         comm = self._comm
-        sides = (self.there, self.here) if back else (self.here, self.there)
+        sides = (self.master, self.slave) if back else (self.slave, self.master)
         source, target = sides
         x, _ = source.facets.positions(facet, xi, u)
         start, _ = (x, None) if u is None else source.facets.positions(facet, xi)
@@ -367,4 +367,4 @@ def interpolation_matrix(
     values = np.broadcast_to(weights[order][:, None, :], columns.shape)
     pointers = np.concatenate([[0], np.cumsum(np.repeat(n_entries, d))])
     n_columns = space.dofmap.index_map.size_local * bs
-    return sparse_matrix(space.mesh.comm, n_columns, pointers, columns.ravel(), values.ravel())
+    return create_csr_matrix(space.mesh.comm, n_columns, pointers, columns.ravel(), values.ravel())

@@ -18,9 +18,9 @@ from petsc4py import PETSc
 
 from fenics_contact import compat
 from fenics_contact.arguments import check_cells, check_instance, is_number
-from fenics_contact.compiling import compile_form, printed_as_ever
+from fenics_contact.compiling import compile_form, default_print_options
 from fenics_contact.parallel import gather_rows, global_max, global_min
-from fenics_contact.surface.mass import assembled
+from fenics_contact.surface.mass import assemble_values
 from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Indices
 
@@ -379,7 +379,7 @@ class SurfaceQuadrature:
         """Return weight times Jacobian of all points, ghosts included. Collective."""
         space = self.space()
         form = compile_form(ufl.TestFunction(space) * measure, self.surface.entity_maps)
-        return assembled(form, la.vector(space.dofmap.index_map, 1))
+        return assemble_values(form, la.vector(space.dofmap.index_map, 1))
 
     @cached_property
     def on_submesh(self) -> tuple[ufl.Measure, Array]:
@@ -397,7 +397,7 @@ class SurfaceQuadrature:
         if size not in self._spaces:
             shape = () if size is None else (size,)
             points, weights = self._points_and_weights or (None, None)
-            with printed_as_ever():
+            with default_print_options():
                 element = basix.ufl.quadrature_element(
                     self._cell,
                     value_shape=shape,
@@ -489,7 +489,7 @@ class VertexAreas:
         Raises:
             ValueError: The area of a vertex is not positive.
         """
-        assembled(self._form, self.area.x)
+        assemble_values(self._form, self.area.x)
         smallest = global_min(self._comm, self.area.x.array, empty=1.0)
         if not smallest > 0.0:
             raise ValueError(
@@ -550,7 +550,7 @@ class PointEvaluator:
 
         Shapes are (n_points,) for scalars and (n_points, d) for vectors.
         """
-        weighted = assembled(self._compiled, self._vector).reshape(-1, self._size)
+        weighted = assemble_values(self._compiled, self._vector).reshape(-1, self._size)
         with np.errstate(invalid="ignore", divide="ignore"):
             values = weighted / self._weights[:, None]
         return {name: values[: self._n_owned, c].copy() for name, c in self._columns.items()}

@@ -18,7 +18,7 @@ from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["MOST_EXCUSED", "InitialForces", "Labels", "Norms", "Parts", "by_body"]
+__all__ = ["MAX_ROUND_OFF_RESIDUAL_RATIO", "InitialForces", "Labels", "Norms", "Parts", "by_body"]
 
 Labels = npt.NDArray[np.intp]
 
@@ -29,7 +29,7 @@ _KU_ROUND_OFF = 40 * np.finfo(float).eps
 # displacement at the start: a diverging rigid motion must not widen the tolerance.
 _MAX_DISPLACEMENT_RATIO = 1e3
 # Largest round-off tolerance relative to the load or, without constraints, to the contact forces.
-MOST_EXCUSED = 1e-5
+MAX_ROUND_OFF_RESIDUAL_RATIO = 1e-5
 # Forces below this are subnormal remainders of a load that was removed.
 _MIN_FORCE = np.finfo(float).tiny / np.finfo(float).eps
 
@@ -55,8 +55,8 @@ class Norms:
         residual: Norm over the free unknowns, (n_parts,) (force).
         force: Largest of the norms of load, reactions and contact forces, (n_parts,) (force).
         floor: Smallest tolerance, from round-off, (n_parts,) (force).
-        round_off: Round-off of the internal forces of loaded parts, not limited by `MOST_EXCUSED`,
-            0 for others, (n_parts,) (force).
+        round_off: Round-off of the internal forces of loaded parts, 0 for others, not limited by
+            `MAX_ROUND_OFF_RESIDUAL_RATIO`, (n_parts,) (force).
         n_bodies: Number of bodies and free obstacles, which partition the unknowns.
     """
 
@@ -188,12 +188,15 @@ class Parts:
             axis=0, initial=0.0
         )
         cap, local_cap = (
-            np.maximum(MOST_EXCUSED * norm, unloaded) for norm in (force, local_force)
+            np.maximum(MAX_ROUND_OFF_RESIDUAL_RATIO * norm, unloaded)
+            for norm in (force, local_force)
         )
         floor = np.where(limited, np.minimum(round_off, cap), round_off)
         floor = np.maximum(floor, _MIN_FORCE)
         local_floor = np.where(active, np.minimum(round_off, local_cap), round_off)
-        uncapped = np.where(active & (unloaded <= MOST_EXCUSED * local_force), round_off, 0.0)
+        uncapped = np.where(
+            active & (unloaded <= MAX_ROUND_OFF_RESIDUAL_RATIO * local_force), round_off, 0.0
+        )
         governing = [
             _measure_contact(pairs, *rows)
             for pairs, *rows in zip(
@@ -201,7 +204,9 @@ class Parts:
             )
         ]
         of_contacts = np.reshape(governing, (len(contacts), 4)).T
-        significant = (loaded | active.any(axis=0)) & (unloaded <= MOST_EXCUSED * force)
+        significant = (loaded | active.any(axis=0)) & (
+            unloaded <= MAX_ROUND_OFF_RESIDUAL_RATIO * force
+        )
         of_bodies = np.array([residuals, force, floor, np.where(significant, round_off, 0.0)])
         residual, force, floor, round_off = np.concatenate([of_bodies, of_contacts], axis=1)
         return Norms(residual, force, floor, round_off, n)

@@ -18,7 +18,7 @@ from petsc4py import PETSc
 from ufl.algorithms import extract_coefficients
 from ufl.corealg.traversal import unique_pre_traversal
 
-from fenics_contact.compiling import compile_by_rule, compile_expression, compile_form
+from fenics_contact.compiling import compile_by_quadrature_rule, compile_expression, compile_form
 from fenics_contact.parallel import all_finite, collective_errors, global_max, global_min
 from fenics_contact.surface.dependence import Dependence
 from fenics_contact.surface.displacement import Displacement
@@ -80,12 +80,16 @@ class Bulk:
         if space != u.function_space:
             raise ValueError(
                 "the TestFunction of F and u are of different function spaces"
-                + ("; use v, q = ufl.TestFunctions(W) of its space W" if displacement.mixed else "")
+                + (
+                    "; use v, q = ufl.TestFunctions(W) of its space W"
+                    if displacement.is_mixed
+                    else ""
+                )
             )
         if u not in form.coefficients():
             raise ValueError(
                 "F does not depend on u: write the residual with the Function u itself"
-                + (", with the parts of ufl.split(w)" if displacement.mixed else "")
+                + (", with the parts of ufl.split(w)" if displacement.is_mixed else "")
             )
         for other in form.coefficients():
             if other is not u and np.shares_memory(other.x.array, u.x.array):
@@ -105,7 +109,7 @@ class Bulk:
         kinds = dict.fromkeys(integral.integral_type() for integral in form.integrals())
         parts = (_Part(form, kind, u) for kind in kinds)
         self._parts = [part for part in parts if not part.is_empty]
-        self._compiled_tangent = compile_by_rule(self.tangent_form)
+        self._compiled_tangent = compile_by_quadrature_rule(self.tangent_form)
         self._pattern = (
             self._compiled_tangent[0]
             if len(self._compiled_tangent) == 1
@@ -163,7 +167,7 @@ class Bulk:
             of_displacement = self.displacement.within(np.ones(self.displacement.n_owned))
             sizes = np.abs(diagonal.array_r * of_displacement)
             self.scale = global_max(self._u.function_space.mesh.comm, sizes)
-        if self.displacement.mixed:
+        if self.displacement.is_mixed:
             self._apply_units()
             diagonal.destroy()
             diagonal = self.stiffness.getDiagonal()
@@ -403,7 +407,7 @@ class _Part:
         ).empty()  # a load that is 0 in UFL
         at_zero = ufl.replace(integrals, {u: ufl.zero(u.ufl_shape)})
         self._is_zero = ufl.algorithms.expand_derivatives(at_zero).empty()
-        self._compiled = compile_by_rule(integrals)
+        self._compiled = compile_by_quadrature_rule(integrals)
         self._u = u
         others = [c for c in integrals.coefficients() if c is not u]
         self._dependence = Dependence(integrals.constants(), others)

@@ -21,7 +21,7 @@ from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import DofSubset
 from fenics_contact.types import Array, Indices
 
-__all__ = ["CondensedSystem", "all_retained", "inexpensive", "worthwhile"]
+__all__ = ["CondensedSystem", "is_worthwhile", "n_inexpensive", "should_retain_all"]
 
 # Five dense matrices are stored, of 200 MB each at this number of unknowns.
 _MAX_DENSE_DOFS = 5000
@@ -44,7 +44,7 @@ _INEXPENSIVE_RATIO = 0.25
 _RETAIN_ALL_RATIO = {2: 1.0, 3: 0.5}
 
 
-def worthwhile(n: int, n_retained: int, dimension: int) -> bool:
+def is_worthwhile(n: int, n_retained: int, dimension: int) -> bool:
     """Return whether memory and cost favour condensing ``n`` unknowns onto ``n_retained``.
 
     In two dimensions the Schur complement costs no more than a plain factorisation (0.45 s against
@@ -62,12 +62,12 @@ def _max_dofs(n: int, dimension: int) -> float:
     return min(_MAX_DENSE_DOFS, max(_CHEAP_DOFS, plane, _MAX_SURFACE_RATIO[dimension] * surface))
 
 
-def inexpensive(n: int, dimension: int) -> int:
+def n_inexpensive(n: int, dimension: int) -> int:
     """Return how many unknowns can be retained at negligible additional cost."""
     return int(max(_CHEAP_DOFS, _INEXPENSIVE_RATIO * _max_dofs(n, dimension)))
 
 
-def all_retained(n: int, n_touched: int, dimension: int) -> bool:
+def should_retain_all(n: int, n_touched: int, dimension: int) -> bool:
     """Return whether to retain all dofs that the contacts couple, active or not."""
     return n_touched <= max(2 * _CHEAP_DOFS, _RETAIN_ALL_RATIO[dimension] * _max_dofs(n, dimension))
 
@@ -84,7 +84,7 @@ class CondensedSystem(System):
     unknowns: DofSubset
     # A dense factorisation costs ten iterations. With fewer iterations per round L-BFGS reduces to
     # Newton's method without globalisation, which fails at a stiffness of 100 E/h.
-    iterations_per_round = 8
+    iterations_per_restart = 8
 
     def __init__(self, full: FullSystem, unknowns: DofSubset, *, prefix: str = "") -> None:
         retained = unknowns.retained

@@ -16,7 +16,7 @@ import scipy.linalg
 import scipy.sparse
 from petsc4py import PETSc
 
-from fenics_contact.compat import sparse_matrix
+from fenics_contact.compat import create_csr_matrix
 from fenics_contact.systems.substructure import SINGULAR, Substructure
 from fenics_contact.types import Array, Index, Indices, Mask
 
@@ -221,7 +221,7 @@ class Dissection:
         )
         local.sort_indices()
         factors = Substructure(
-            sparse_matrix(PETSc.COMM_SELF, size, local.indptr, local.indices, local.data),
+            create_csr_matrix(PETSc.COMM_SELF, size, local.indptr, local.indices, local.data),
             np.arange(n, size, dtype=np.int32),
             symmetric=self._symmetric,
             prefix=self._prefix,

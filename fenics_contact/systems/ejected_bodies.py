@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fenics_contact.parallel import global_sum
-from fenics_contact.systems.balance import MOST_EXCUSED, InitialForces
+from fenics_contact.systems.balance import MAX_ROUND_OFF_RESIDUAL_RATIO, InitialForces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.least_motion import find_least_motion
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
@@ -53,7 +53,9 @@ def find_ejected_bodies(
     # A loaded body is not in equilibrium, and may be in initial positioning.
     forces = full.by_body(*contacts, full.load)
     force, committed = (each.sum(axis=0)[:n] for each in (forces, start.contact))
-    negligible = (force <= ROUND_OFF * scales.force) | (force <= MOST_EXCUSED * committed)
+    negligible = (force <= ROUND_OFF * scales.force) | (
+        force <= MAX_ROUND_OFF_RESIDUAL_RATIO * committed
+    )
     unloaded = unconstrained & negligible
     if not unloaded.any():
         return {}
@@ -127,7 +129,7 @@ def _measure_contact_motion(full: FullSystem, change: Array) -> Array:
         if kinematics.is_rigid:
             # Within an iteration the stored values may belong to another state.
             relative = contact.states.evaluate_present().jump - kinematics.committed_jump
-            displacement = operator.jump(of_bodies) - kinematics.turned(relative)
+            displacement = operator.jump(of_bodies) - kinematics.rotate(relative)
             length = np.maximum(length, np.linalg.norm(displacement, axis=1))
         largest = np.maximum(largest, scales.largest_at_points(number, length))
     return largest

@@ -53,7 +53,7 @@ class FullSystem(System):
         n, body = connected_bodies(space)
         n_motions = sum(len(contact.motions) for contact in contacts)
         dofs = np.repeat(body, space.dofmap.bs)[: unknowns.n_dofs]
-        if displacement.mixed:  # by the adjacent cells
+        if displacement.is_mixed:  # by the adjacent cells
             label = np.zeros(u.x.array.size, dtype=body.dtype)
             label[u.function_space.dofmap.list] = body[space.dofmap.list[:, :1]]
             dofs = label[: unknowns.n_dofs]
@@ -71,7 +71,7 @@ class FullSystem(System):
         self.body = body
 
     @property
-    def iterations_per_round(self) -> int:
+    def iterations_per_restart(self) -> int:
         """Iterations of L-BFGS between two assemblies of H₀.
 
         Pairs from before a change of status help little. An iteration costs 1/15 to 1/35 of a
@@ -131,7 +131,7 @@ class FullSystem(System):
         n = self.unknowns.n_dofs
         self.u.x.array[:n] = self.bulk.from_units(state[:n])
         self.u.x.scatter_forward()
-        self.displacement.follow()
+        self.displacement.update()
         self.set_motions(state)
 
     def evaluate_at(self, state: Array) -> None:
@@ -150,7 +150,7 @@ class FullSystem(System):
         whole = fem.Function(self.u.function_space)
         whole.x.array[:n] = self.bulk.from_units(state[:n])
         whole.x.scatter_forward()
-        if not self.displacement.mixed:
+        if not self.displacement.is_mixed:
             return whole
         u = fem.Function(self.displacement.u.function_space)
         u.x.array[:] = whole.x.array[self.displacement.dofs]
@@ -172,7 +172,7 @@ class FullSystem(System):
         terms = super().terms(state)
         if not self.bulk.linear:
             terms = terms + self.diagonal * self._cell_size
-        if not self.displacement.mixed:
+        if not self.displacement.is_mixed:
             return terms
         largest = global_max(self.unknowns.comm, np.abs(state[self._is_displacement]))
         return np.where(self._is_displacement, terms, self.bulk.scale * largest)
@@ -261,7 +261,7 @@ class FullSystem(System):
         matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         # Rigid-body modes of obstacles and pressures are not treated.
-        if matrix.getBlockSize() == self.gdim and not self.displacement.mixed:
+        if matrix.getBlockSize() == self.gdim and not self.displacement.is_mixed:
             if self._near_nullspace is None:
                 self._near_nullspace = linear.near_nullspace(self.u.function_space)
             matrix.setNearNullSpace(self._near_nullspace)

@@ -38,9 +38,9 @@ class TrackedModulus:
         """Evaluate E from the bulk form and update the contacts. Collective."""
         if self._contacts:
             weight = self._contacts[0].inputs.weight
-            self.put_back(cell_modulus(self._bulk.tangent_form, self._displacement, weight))
+            self.restore(cell_modulus(self._bulk.tangent_form, self._displacement, weight))
 
-    def put_back(self, modulus: fem.Function | None) -> None:
+    def restore(self, modulus: fem.Function | None) -> None:
         """Set E to an earlier value of ``present`` and update the contacts. Collective."""
         self.present = modulus
         if modulus is not None:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from fenics_contact.parallel import global_max
-from fenics_contact.surface.mass import mass_solver
+from fenics_contact.surface.mass import create_mass_solver
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Array, Mask
@@ -38,7 +38,7 @@ def project_multiplier_updates(operator: ContactOperator, state: Array, constrai
     multipliers = contact.multipliers
     if multipliers is None or not multipliers.as_displacement or not contact.law.has_friction:
         return
-    if contact.contact_kinematics.turns:
+    if contact.contact_kinematics.has_rotation:
         return
     fixed = _find_fixed_dofs(operator, state, constrained)
     if not global_max(operator.unknowns.comm, fixed.astype(np.float64)):
@@ -53,7 +53,7 @@ def project_multiplier_updates(operator: ContactOperator, state: Array, constrai
     force.pointwiseMult(free, force)
     # Rows of fixed dofs become empty, without forces.
     stiffness.diagonalScale(free, free)
-    solver = mass_solver(stiffness, rtol=ROUND_OFF, atol=1e-300, max_it=500)
+    solver = create_mass_solver(stiffness, rtol=ROUND_OFF, atol=1e-300, max_it=500)
     solver.solve(force, projection)
     multipliers.leave_out(change - values.tangential(operator.jump(projection.array_r)))
     for item in (force, stiffness, free, projection, solver):

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from petsc4py import PETSc
 
-from fenics_contact.compat import sparse_matrix
+from fenics_contact.compat import create_csr_matrix
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.point_law import PointTangent
 from fenics_contact.parallel import global_sum
@@ -54,7 +54,7 @@ class ContactOperator:
         self.unknowns = unknowns or Unknowns(displacement.whole.function_space)
         self._gdim = contact.surface.mesh.geometry.dim
         self._first = self.unknowns.first_motion + first_motion
-        jump_map = self.unknowns.widen(displacement.lifted(contact.pairs.jump_map))
+        jump_map = self.unknowns.widen(displacement.expand_columns(contact.pairs.jump_map))
         self._of_bodies = _drop_zeros(jump_map)
         self.within = self._find_within()
         self._motions: PETSc.Mat | None = None
@@ -105,7 +105,7 @@ class ContactOperator:
         columns = np.tile(self._first + np.arange(len(components)), n)
         pointers = np.concatenate([[0], np.cumsum(counts)])
         ones = np.ones(columns.size)
-        return sparse_matrix(self.unknowns.comm, self.unknowns.n_local, pointers, columns, ones)
+        return create_csr_matrix(self.unknowns.comm, self.unknowns.n_local, pointers, columns, ones)
 
     @cached_property
     def touched(self) -> Indices:
@@ -118,7 +118,7 @@ class ContactOperator:
         pairs, displacement = self.contact.pairs, self.contact.displacement
         if not self.contact.contact_kinematics.follows:
             return self.touched
-        reach = self.unknowns.widen(displacement.lifted(pairs.reach))
+        reach = self.unknowns.widen(displacement.expand_columns(pairs.reach))
         return self._coupled(reach, np.ones(reach.getLocalSize()[0]))
 
     def find_dofs(self, chosen: Mask) -> Indices:
@@ -129,7 +129,9 @@ class ContactOperator:
         """Return the columns with an entry in chosen rows, and the angle. Collective."""
         pointers, columns, values = matrix.getValuesCSR()
         pattern = (values != 0.0).astype(np.float64)
-        indicator = sparse_matrix(matrix.comm, matrix.getLocalSize()[1], pointers, columns, pattern)
+        indicator = create_csr_matrix(
+            matrix.comm, matrix.getLocalSize()[1], pointers, columns, pattern
+        )
         points, counts = indicator.createVecLeft(), indicator.createVecRight()
         points.array[:] = rows
         indicator.multTranspose(points, counts)
@@ -209,13 +211,13 @@ class ContactOperator:
         tangent = tangent or self.contact.effective_law.tangent()
         local = self.contact.pairs.local_map
         if local is not None:  # finite sliding; see `FiniteSlidingPairs.tangent`
-            lifted = self.unknowns.widen(self.contact.displacement.lifted(local))
+            lifted = self.unknowns.widen(self.contact.displacement.expand_columns(local))
             return self._assemble_product(
                 -self.contact.area[:, None, None] * tangent.by_jump, lifted
             )
-        if tangent.spun is not None and self._angle is not None:
+        if tangent.by_rotation is not None and self._angle is not None:
             product = self.springs(-tangent.by_jump)
-            self._add_rotation(product, tangent.spun, self._angle)
+            self._add_rotation(product, tangent.by_rotation, self._angle)
             return product
         if tangent.by_shift is None:
             return self.springs(-tangent.by_jump)
@@ -239,7 +241,7 @@ class ContactOperator:
             Array (n_points, gdim); zero where a point is not within.
         """
         arms = np.asarray(
-            self.contact.contact_kinematics.turning_rate() / self._length, dtype=np.float64
+            self.contact.contact_kinematics.rotation_derivative() / self._length, dtype=np.float64
         )
         return arms if self.within is None else np.where(self.within[:, None], arms, 0.0)
 
@@ -257,7 +259,7 @@ class ContactOperator:
         """Create a matrix with one nonzero column, in given local rows, ascending."""
         pointers = np.searchsorted(rows, np.arange(n_rows + 1))
         columns, unknowns = np.full(len(values), column), self.unknowns
-        return sparse_matrix(unknowns.comm, unknowns.n_local, pointers, columns, values)
+        return create_csr_matrix(unknowns.comm, unknowns.n_local, pointers, columns, values)
 
     def _add_rotation(self, product: PETSc.Mat, rotated: Array, column: int) -> None:
         """Add the rotation of tractions and arms with the obstacle to DᵀBD. Collective.
@@ -312,7 +314,7 @@ class ContactOperator:
         columns = np.broadcast_to(columns, (len(columns), d, d))
         pointers = np.insert(np.cumsum(np.repeat(d * nonzero, d)), 0, 0)
         n_rows, entries = matrix.getLocalSize()[0], blocks[nonzero].ravel()
-        return sparse_matrix(self.unknowns.comm, n_rows, pointers, columns.ravel(), entries)
+        return create_csr_matrix(self.unknowns.comm, n_rows, pointers, columns.ravel(), entries)
 
 
 def _drop_zeros(matrix: PETSc.Mat) -> PETSc.Mat:
@@ -320,4 +322,4 @@ def _drop_zeros(matrix: PETSc.Mat) -> PETSc.Mat:
     pointers, columns, values = matrix.getValuesCSR()
     nonzero = values != 0.0
     pointers, n_columns = np.append(0, np.cumsum(nonzero))[pointers], matrix.getLocalSize()[1]
-    return sparse_matrix(matrix.comm, n_columns, pointers, columns[nonzero], values[nonzero])
+    return create_csr_matrix(matrix.comm, n_columns, pointers, columns[nonzero], values[nonzero])

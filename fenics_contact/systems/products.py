@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse
 from petsc4py import PETSc
 
-from fenics_contact.compat import sparse_matrix
+from fenics_contact.compat import create_csr_matrix
 from fenics_contact.types import Array
 
 __all__ = ["PointProduct"]
@@ -65,4 +65,4 @@ class PointProduct:
             parts = np.zeros(self._entry.size)
             self._comm.Gatherv(values, (parts, self._counts))
             values = np.bincount(self._entry, parts, minlength=self._columns.size)
-        return sparse_matrix(self._comm, self._rows, self._pointers, self._columns, values)
+        return create_csr_matrix(self._comm, self._rows, self._pointers, self._columns, values)

@@ -155,7 +155,7 @@ class RigidBodyModes(RigidMotions):
         """
         all_motions = coefficients @ self.free
         linear = self._full.bulk.linear
-        return self.field(*self._split(all_motions)) if linear else self.turned(all_motions)
+        return self.field(*self._split(all_motions)) if linear else self.rotate(all_motions)
 
     def is_constrained(self, operators: Sequence[ContactOperator]) -> bool:
         """Return whether active points constrain every free motion. Collective.
@@ -351,7 +351,7 @@ def _slip_direction(contact: Contact, values: PointValues) -> Array:
     The traction is constant along it unless the friction bound depends on the motion.
     """
     size = np.linalg.norm(values.traction, axis=1)
-    is_slipping = values.slips & (size > 0) & contact.law.has_friction
+    is_slipping = values.is_slipping & (size > 0) & contact.law.has_friction
     is_slipping &= not contact.effective_law.own.bound_depends_on_motion
     direction = values.traction * (is_slipping / np.where(is_slipping, size, 1.0))[:, None]
     return np.asarray(direction, dtype=np.float64)

@@ -15,7 +15,7 @@ from fenics_contact.systems.reference_scales import body_of_points
 from fenics_contact.systems.system import System
 from fenics_contact.tolerances import FLAT
 from fenics_contact.types import Array, Index
-from fenics_contact.wording import place_in_words
+from fenics_contact.wording import format_point
 
 __all__ = ["RigidMotions"]
 
@@ -49,7 +49,7 @@ class RigidMotions:
         self.names: list[str] = []
         lengths: list[float] = []
         for b, (centre, size) in enumerate(zip(self._centres, self._sizes, strict=True)):
-            of = f" of body {b + 1}, near {place_in_words(centre)}" if self._n_bodies > 1 else ""
+            of = f" of body {b + 1}, near {format_point(centre)}" if self._n_bodies > 1 else ""
             for name in rigid_motions(x[:0], 1.0):
                 self.names.append(name + of)
                 lengths.append(size if name.startswith("rotation") else 0.0)
@@ -114,7 +114,7 @@ class RigidMotions:
             obstacles[:] = values[self._unknowns.n_dofs :]
         return np.append(self.by_body(self._full, values, of_bodies), obstacles)
 
-    def turned(self, coefficients: Array) -> Array:
+    def rotate(self, coefficients: Array) -> Array:
         """Return the change of the unknowns, (n_local,), for finite motions from the present state.
 
         The coefficients are of all motions, (n_motions,).

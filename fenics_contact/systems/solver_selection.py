@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from fenics_contact.systems import linear
 from fenics_contact.systems.candidate_dofs import touched
-from fenics_contact.systems.condensed import all_retained, worthwhile
+from fenics_contact.systems.condensed import is_worthwhile, should_retain_all
 from fenics_contact.systems.full import FullSystem
 
 __all__ = ["linear_kind", "reason_not_to_condense"]
@@ -25,7 +25,7 @@ def reason_not_to_condense(
 
     Args:
         full: The system on all unknowns.
-        wanted: The user's choice; None: condense if possible and worthwhile.
+        wanted: The user's choice; None: condense if possible and is_worthwhile.
         linear_solver: The user's choice for systems over all unknowns.
         named: Options given that select a linear solver, which excludes the dense one.
         increments: Expected number of increments.
@@ -40,11 +40,11 @@ def reason_not_to_condense(
         reason = "there is no contact"
     elif not full.bulk.linear:
         reason = "the bulk is not linear in u"
-    elif full.displacement.mixed:
+    elif full.displacement.is_mixed:
         reason = "the displacement is a part of a mixed function"
     elif full.follows and not full.scales.constrained.all():
         reason = "bodies with finite kinematics are constrained by contact only"
-    elif full.follows and not all_retained(unknowns.n_global, _count_coupled(full), gdim):
+    elif full.follows and not should_retain_all(unknowns.n_global, _count_coupled(full), gdim):
         reason = "finite kinematics couple more dofs than can be retained"
     elif named:
         reason = f"the options name a linear solver ({', '.join(named)})"
@@ -57,7 +57,7 @@ def reason_not_to_condense(
     if wanted or reason:
         return reason
     n = unknowns.n_global
-    if n_retained == n or not worthwhile(n, n_retained, gdim):
+    if n_retained == n or not is_worthwhile(n, n_retained, gdim):
         return f"contact couples {n_retained} of {n} unknowns, too many for it to save time"
     if unknowns.n_motions or linear_solver is not None:
         return None
@@ -98,7 +98,7 @@ def linear_kind(
         ValueError: The user's choice does not work.
     """
     kind, reason = wanted, "chosen by linear_solver"
-    if full.displacement.mixed:
+    if full.displacement.is_mixed:
         if kind == "multigrid":
             raise ValueError(
                 "linear_solver is 'multigrid', but u is a part of a mixed function, whose "

@@ -88,7 +88,7 @@ class System(ABC):
 
     @property
     @abstractmethod
-    def iterations_per_round(self) -> int:
+    def iterations_per_restart(self) -> int:
         """Iterations of L-BFGS between two assemblies of H₀."""
 
     # ---- contact and force balance ---------------------------------------------------------------
@@ -185,7 +185,7 @@ class System(ABC):
         return InitialForces(np.zeros(self.n_bodies), self.by_body(*forces))
 
     @property
-    def confined(self) -> bool:
+    def is_restricted(self) -> bool:
         """Whether some points of Γc depend on unknowns outside of the system. Collective."""
         return any(operator.within is not None for operator in self.operators)
 
@@ -247,7 +247,7 @@ class System(ABC):
         for motion, value in zip(self._motions, self.unknowns.motions(state), strict=True):
             motion.set_value(value)
 
-    def is_twisted(self) -> bool:
+    def is_over_rotated(self) -> bool:
         """Return whether a free obstacle has rotated by a right angle or more in the increment.
 
         Solutions are not unique beyond: after a full turn its points are at the same positions.

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact.compat import sparse_matrix
+from fenics_contact.compat import create_csr_matrix
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["DofSubset", "Unknowns"]
@@ -89,7 +89,7 @@ class Unknowns:
             pointers = np.append(pointers, pointers[-1] + 1 + diagonal)
             columns = np.append(columns, self.first_motion + diagonal)
             values = np.append(values, np.zeros(n_added))
-        return sparse_matrix(self.comm, self.n_local, pointers, columns, values)
+        return create_csr_matrix(self.comm, self.n_local, pointers, columns, values)
 
 
 class DofSubset(Unknowns):
@@ -154,6 +154,6 @@ class DofSubset(Unknowns):
         pointers, columns, values = matrix.getValuesCSR()
         position, is_retained = self._find(columns)
         pointers = np.concatenate([[0], np.cumsum(is_retained)])[pointers]
-        return sparse_matrix(
+        return create_csr_matrix(
             self.comm, self.n_local, pointers, position[is_retained], values[is_retained]
         )

@@ -23,7 +23,7 @@ from fenics_contact.systems.full import FullSystem
 from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
 
-__all__ = ["OppositePoints"]
+__all__ = ["PairIteration"]
 
 _MAX_PAIRINGS = 10  # of a contact in an increment; 2 to 4 usually suffice
 _MIN_RELAXATION, _MAX_RELAXATION = 0.1, 2.0
@@ -53,7 +53,7 @@ class _Pairing:
     kinematics: KinematicsState | None = None
 
 
-class OppositePoints:
+class PairIteration:
     """Fixed-point iteration for the pairs of an increment.
 
     Args:
@@ -143,7 +143,7 @@ class OppositePoints:
             self._pairings, self.end = {}, None
         return predicted
 
-    def to_update(self) -> list[Contact]:
+    def find_outdated(self) -> list[Contact]:
         """Return contacts that need new pairs (`ContactKinematics.needs_new_pairs`). Collective."""
         return [
             c
@@ -152,7 +152,7 @@ class OppositePoints:
             and c.contact_kinematics.needs_new_pairs(c.values)
         ]
 
-    def to_update_for(self, names: Sequence[str]) -> list[Contact]:
+    def find_outdated_for(self, names: Sequence[str]) -> list[Contact]:
         """Return contacts whose pairs may cause a large small-displacement error. Collective.
 
         Their points have slid; or they have the error and pairs of an earlier increment, in which
@@ -178,7 +178,7 @@ class OppositePoints:
         pairing = self._pairings.get(contact.name)
         return 0 if pairing is None else pairing.number
 
-    def choose_states(self, contacts: Sequence[Contact], end: Array) -> None:
+    def relax_states(self, contacts: Sequence[Contact], end: Array) -> None:
         """Set the states in which the next pairs of evaluated contacts are found. Collective.
 
         Args:
@@ -239,4 +239,4 @@ class OppositePoints:
             contact.states.restore()
             pairing = self._pairings.get(contact.name)
             if pairing is not None and pairing.kinematics is not None:
-                contact.states.begin_between(pairing.kinematics)
+                contact.states.start_with_pairs(pairing.kinematics)

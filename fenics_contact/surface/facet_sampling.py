@@ -15,10 +15,10 @@ from fenics_contact.surface.projection import polynomial_space
 from fenics_contact.surface.surface import SurfaceQuadrature
 from fenics_contact.types import Array, Index
 
-__all__ = ["FacetPlaces"]
+__all__ = ["FacetSampling"]
 
 
-class FacetPlaces:
+class FacetSampling:
     """Quadrature points, corners, edge midpoints and centres of the facets of Γc.
 
     The deformed Γc is given by its nodes: on each facet those of a Lagrange element of the degree
@@ -34,8 +34,8 @@ class FacetPlaces:
         facet: Facet of this rank of every place, (n,); quadrature points first, ordered as `rows`.
         reference: Reference coordinates of every place on its facet, (n, gdim - 1).
         size: Length of every facet of this rank, in 3D the root of its area, (n_facets,) (length).
-        points_carry_nodes: Whether displacement and geometry at the quadrature points of a facet
-            determine those at its nodes.
+        points_determine_nodes: Whether displacement and geometry at the quadrature points of a
+            facet determine those at its nodes.
     """
 
     def __init__(self, quadrature: SurfaceQuadrature, space: fem.FunctionSpace, x: Array) -> None:
@@ -57,7 +57,7 @@ class FacetPlaces:
         basis = polynomial_space(self.facets.kind, min(n_points, self._element.dim))
         table = tabulate(basis, 0, at)[0, :, :, 0].reshape(n_facets, n_points, basis.dim)
         self._fit = tabulate(basis, 0, self._element.points)[0, :, :, 0] @ np.linalg.pinv(table)
-        self.points_carry_nodes = basis.dim == self._element.dim
+        self.points_determine_nodes = basis.dim == self._element.dim
 
     def at_nodes(
         self, points: Array, u: fem.Function | None, rotate: Callable[[Array], Array]
@@ -77,7 +77,7 @@ class FacetPlaces:
         """
         rows = points[self.rows]
         positions = self._fit @ rows
-        if not self.points_carry_nodes:
+        if not self.points_determine_nodes:
             own = slice(self.rows.size)
             start, _ = self.facets.positions(self.facet[own], self.reference[own], u)
             remainder, _ = self.facets.positions(*self._nodes, u)
@@ -122,6 +122,6 @@ class FacetPlaces:
         sign = np.repeat(self.facets.outward, n_pieces)
         return MovingFacets(first, last, sign, vertices)
 
-    def piece_middles(self) -> Array:
+    def piece_centres(self) -> Array:
         """Return the centres of the facets' flat pieces on the undeformed Γc, (n, gdim)."""
         return self.facets.positions(*self.facets.combine(self._pieces.mean(axis=1)))[0]
