@@ -237,9 +237,9 @@ class Equations:
             self.full.update_stiffness()
         self.full.evaluate()
         if not trial:
-            self.note()
+            self.record_iterate()
 
-    def note(self) -> None:
+    def record_iterate(self) -> None:
         """Record residual and status of the evaluated iterate in the monitor."""
         self.monitor.record(self.norms.total)
 
@@ -257,7 +257,7 @@ class Equations:
         Open points with a friction bound independent of the pressure slip. The regularisation
         vanishes with the residual: convergence remains superlinear (Levenberg-Marquardt).
         """
-        full, modes = self.full, self._unconstrained_modes()
+        full, modes = self.full, self._find_unconstrained_modes()
         if modes is None or np.isnan(modes.imbalance).all():
             self.regularised_modes = np.zeros((0, 0))
             yield from self.tangents()
@@ -281,7 +281,7 @@ class Equations:
             tangential += slip_ratio * values.friction_secant
             yield operator.springs(values.springs(normal, tangential))
 
-    def _unconstrained_modes(self) -> UnconstrainedModes | None:
+    def _find_unconstrained_modes(self) -> UnconstrainedModes | None:
         """Find the modes that contact leaves unconstrained at the evaluated state. Collective."""
         full, motions = self.full, self.motions
         if not len(motions.free):

@@ -74,7 +74,7 @@ def check_balance(modes: RigidBodyModes, load: Array, operators: Sequence[Contac
     if not resultant.any():
         return
     comm = modes.comm
-    local_rays = [_admissible_forces(o, modes.at_points(o)[rows]) for o in operators]
+    local_rays = [_compute_admissible_forces(o, modes.at_points(o)[rows]) for o in operators]
     all_rays = gather_rows(comm, np.concatenate([np.zeros((0, len(rows))), *local_rays]))
     acts = (np.abs(all_rays) > _ZERO_MODE).astype(np.float64)
     couples = acts.T @ acts + modes.of_same_body()[np.ix_(rows, rows)]
@@ -91,7 +91,7 @@ def check_balance(modes: RigidBodyModes, load: Array, operators: Sequence[Contac
         residual = broadcast_from_root(comm, unbalanced(rays.T, direction)) if len(rays) else 1.0
         allowed = _ZERO_FORCE_RATIO * max(1.0, size[group].max() / largest)
         if residual > allowed:
-            limits = broadcast_from_root(comm, _largest_forces(rays.T, direction)) + 0.0  # no -0
+            limits = broadcast_from_root(comm, _maximise_forces(rays.T, direction)) + 0.0  # no -0
             failures += _describe(modes, rows[group], direction, limits, allowed, largest)
     if failures:
         raise ValueError(
@@ -123,7 +123,7 @@ def _describe(
     return descriptions or [f"({names[worst]}) is {-largest * direction[worst]:.6g}"]
 
 
-def _admissible_forces(operator: ContactOperator, modes: Array) -> Array:
+def _compute_admissible_forces(operator: ContactOperator, modes: Array) -> Array:
     """Compute generalised forces of the admissible directions at local points, (n_rays, n_modes).
 
     The modes are given at the points, (n_modes, n_points, gdim).
@@ -177,7 +177,7 @@ def unbalanced(rays: Array, resultant: Array) -> float:
     return float(solution.fun) if solution.status == 0 else 0.0
 
 
-def _largest_forces(rays: Array, force: Array) -> Array:
+def _maximise_forces(rays: Array, force: Array) -> Array:
     """Maximise each component of a force of the cone with the others prescribed, (n_free,).
 
     Each has the sign of ``force``, or is NaN if the others cannot be reached. The rays of the cone,

@@ -74,10 +74,10 @@ class SolverContext:
             part: Part of the prefix of this SNES after the problem's.
             options: Options that differ from `Newton.main_options`.
         """
-        snes, own = self.snes(part, {**Newton.main_options(), **options})
+        snes, own = self.create_snes(part, {**Newton.main_options(), **options})
         return Newton(self.equations, snes, lambda: True, own_solver=own)
 
-    def snes(
+    def create_snes(
         self,
         part: str,
         options: Mapping[str, Any],
@@ -125,7 +125,7 @@ class StandaloneMethod(Method):
         """Create the solvers. Collective."""
 
     @property
-    def suits(self) -> bool:
+    def is_applicable(self) -> bool:
         """Whether the method applies to the problem, without `check` failing."""
         return True
 
@@ -273,7 +273,7 @@ class Newton(SnesMethod):
         if self._equations.full.unknowns.comm.allreduce(int(different)):
             super()._compute_jacobian(x, J)
         else:
-            self._equations.note()
+            self._equations.record_iterate()
 
     def _compute_level(self, x: PETSc.Vec, f: PETSc.Vec) -> float:
         """Compute min(|J⁻¹f| / |J⁻¹f₀|, |f| / |f₀|)² of a residual f at a trial x. Collective.
@@ -304,22 +304,22 @@ class Newton(SnesMethod):
         if ratio <= 1.0 - _MIN_LEVEL_DECREASE:
             return float(ratio * ratio)
         if self._step_norm is None:
-            self._step_norm = self._correction_norm(residual)
+            self._step_norm = self._compute_correction_norm(residual)
         # The first trial is shorter than the full step if that exceeds the limit.
         damping = (x - iterate).norm() / self._step_norm
         required = 1.0 - _MIN_LEVEL_DECREASE * min(1.0, float(damping))
-        level = min(ratio, self._correction_norm(f) / self._step_norm) / required
+        level = min(ratio, self._compute_correction_norm(f) / self._step_norm) / required
         if level > 1.0 and damping > _FULL_STEP_RATIO and self._use_end_tangent:
             tangent = self._equations.matrix(True)
             self._equations.assemble_tangent(x, tangent, trial=True)
-            if self._correction_norm(f) <= required * self._step_norm:
+            if self._compute_correction_norm(f) <= required * self._step_norm:
                 self._trial_point = x.array_r.copy()
                 return 0.0
             self._use_end_tangent, self._trial_point = False, None
             self._equations.assemble_tangent(iterate, tangent, trial=True)
         return float(level * level)  # infinite where it overflows
 
-    def _correction_norm(self, f: PETSc.Vec) -> float:
+    def _compute_correction_norm(self, f: PETSc.Vec) -> float:
         """Compute the norm of J⁻¹f with the present tangent; infinite on failure. Collective."""
         ksp, correction = self.snes.getKSP(), f.duplicate()
         ksp.solve(f, correction)

@@ -91,7 +91,7 @@ class PairIteration:
         """
         if state.change is None:
             return
-        ratio = self._increment_ratio(state, state.change, prescribed, load)
+        ratio = self._compute_increment_ratio(state, state.change, prescribed, load)
         if not self._full.unknowns.comm.allreduce(int(ratio.any())):
             return
         end = state.unknowns + ratio * state.change
@@ -106,7 +106,7 @@ class PairIteration:
         self.predicted = self.replaced
         self.find(state.unknowns)
 
-    def _increment_ratio(
+    def _compute_increment_ratio(
         self, state: State, change: Array, prescribed: Array, load: Array
     ) -> Array:
         """Compare loads and prescribed values of this increment with the last one. Collective.

@@ -65,12 +65,12 @@ class PrimalDual(StandaloneMethod):
 
     def __init__(self, context: SolverContext) -> None:
         equations = self._equations = context.equations
-        self.snes, own = context.snes("primal_dual_", _OPTIONS, with_own=_ITERATED)
+        self.snes, own = context.create_snes("primal_dual_", _OPTIONS, with_own=_ITERATED)
         self._newton = _MixedNewton(equations, self.snes, own_solver=own)
 
     def check(self) -> None:
         """Check that the problem has friction with finite stiffness and a linear bulk."""
-        if not self.suits:
+        if not self.is_applicable:
             raise ValueError(
                 "method is 'primal_dual', which needs friction with stiffness k_n and k_t, small "
                 "displacements, a linear bulk, and obstacles without unknown motions; use another "
@@ -78,7 +78,7 @@ class PrimalDual(StandaloneMethod):
             )
 
     @property
-    def suits(self) -> bool:
+    def is_applicable(self) -> bool:
         """Whether the method applies to the problem."""
         full = self._equations.full
         has_friction = any(contact.law.has_friction for contact in full.contacts)

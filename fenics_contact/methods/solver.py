@@ -512,7 +512,7 @@ class Solver:
             check_balance(self.equations.motions, self._full.load, self._full.operators)
         if fallback and self.can_fall_back():
             others = (name for name in _FALLBACKS if name != self.method)
-            yield from (name for name in others if self.methods[name].suits)
+            yield from (name for name in others if self.methods[name].is_applicable)
 
     def _describe_outcome(self, reason: int) -> str:
         """Describe the outcome of an attempt. Collective."""

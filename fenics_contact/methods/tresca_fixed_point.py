@@ -75,7 +75,7 @@ class TrescaFixedPoint(StandaloneMethod):
     def solve(self) -> tuple[int, int]:
         """Solve the equations; return all Newton iterations and the reason. Collective."""
         equations = self._equations
-        if not self.suits:
+        if not self.is_applicable:
             return 0, int(_REASONS.DIVERGED_LINE_SEARCH)
         for method in (self._search, self._finish):
             method.attach(consistent=False)
@@ -83,8 +83,8 @@ class TrescaFixedPoint(StandaloneMethod):
         best = np.inf
         relaxation = 1.0
         try:
-            residual = self._residual()
-            bound: Array = self._friction_bound()
+            residual = self._compute_residual_norm()
+            bound: Array = self._evaluate_friction_bound()
             for cycle in range(_MAX_CYCLES):
                 overload = equations.find_overload()
                 factor = overload.factor if overload else 1.0
@@ -105,7 +105,7 @@ class TrescaFixedPoint(StandaloneMethod):
                 rtol = 0.0 if equations.has_potential else _SUBPROBLEM_RTOL
                 self._search.atol = self._finish.atol = rtol * residual
                 iterations += self._minimise()
-                residual = self._residual()
+                residual = self._compute_residual_norm()
                 if equations.solved():
                     logger.debug("%d cycles, %d Newton iterations", cycle + 1, iterations)
                     return iterations, int(_REASONS.CONVERGED_FNORM_RELATIVE)
@@ -117,7 +117,7 @@ class TrescaFixedPoint(StandaloneMethod):
                     return iterations, int(_REASONS.DIVERGED_MAX_IT)
                 if stalls and stalls % _STALLS_TO_RELAX == 0:
                     relaxation = max(relaxation / 2, _MIN_RELAXATION)
-                bound = bound + relaxation * (self._friction_bound() - bound)
+                bound = bound + relaxation * (self._evaluate_friction_bound() - bound)
             return iterations, int(_REASONS.DIVERGED_MAX_IT)
         finally:
             equations.is_h0_current = False
@@ -143,7 +143,7 @@ class TrescaFixedPoint(StandaloneMethod):
             )
 
     @property
-    def suits(self) -> bool:
+    def is_applicable(self) -> bool:
         """Whether the method applies to the problem."""
         mixed = self._equations.full.displacement.is_mixed
         return bool(self._equations.contacts) and not mixed and not self._without_potential()
@@ -151,13 +151,13 @@ class TrescaFixedPoint(StandaloneMethod):
     def _without_potential(self) -> list[Contact]:
         return [c for c in self._equations.contacts if not c.effective_law.can_fix_friction_bound]
 
-    def _friction_bound(self) -> Array:
+    def _evaluate_friction_bound(self) -> Array:
         """Evaluate the friction bound of all contacts at the local points (stress)."""
         equations = self._equations
         equations.full.evaluate()
         return np.concatenate([contact.values.friction_bound for contact in equations.contacts])
 
-    def _residual(self) -> float:
+    def _compute_residual_norm(self) -> float:
         """Compute the norm of the residual with the complete law."""
         equations = self._equations
         for contact in equations.contacts:
@@ -188,7 +188,7 @@ class _Minimisation(SnesMethod):
     """
 
     def __init__(self, context: SolverContext, part: str, options: Mapping[str, Any]) -> None:
-        snes, own = context.snes(part, options, consistent=False)
+        snes, own = context.create_snes(part, options, consistent=False)
         super().__init__(context.equations, snes, lambda: False, own_solver=own)
         self.atol = 0.0
 
