@@ -20,6 +20,7 @@ from scenes.blocks import BOTTOM, LEFT, TOP
 from scenes.comparing import close, raised_everywhere
 from verification.fuzz_setup import run_history
 
+COMM = MPI.COMM_WORLD
 TIMES = np.linspace(0.25, 2.0, 8)
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(300)]
 WAYS = [
@@ -175,3 +176,28 @@ def test_forces_that_are_round_off_supply_no_energy(kinematics, E):
         problem.commit()
         assert step.energy.friction_energy_gain == 0.0
         assert np.abs(contact.resultants().force).max() < 1e-12 * E
+
+
+@pytest.mark.parametrize("options", WAYS, ids=["condensed", "lbfgs", "newton"])
+def test_a_load_is_removed_after_a_restart(options):
+    """A block above the floor, its top moved and moved back: at rest, to 1e-15 of the motion.
+
+    Nothing resists, so that all forces at the end are round-off of those at the start: 40 eps of
+    them. After a restart this was taken as none, and every iteration was asked for 1e-9 of what
+    the last one had left.
+    """
+    box = Box((0.0, 0.5), n=(4, 4), bend=lambda x: x + 0.05 * np.sin(7 * x[:, ::-1]))
+    scene = Beside({"block": box})
+    top = scene.bodies.constant(0.0)
+    scene.hold("block", TOP, 0)
+    scene.hold("block", TOP, 1, value=top)
+    problem = scene.problem(
+        scene.contact("block", BOTTOM, fc.HalfSpace((0, 0), (0, 1)), fc.Frictionless()), **options
+    )
+    for top.value in (-0.03, -0.1):
+        problem.solve()
+        problem.commit()
+    problem.restart_solver()
+    top.value = 0.0
+    assert problem.solve().iterations <= 2
+    assert COMM.allreduce(np.abs(problem.u.x.array).max(initial=0.0), op=MPI.MAX) <= 1e-16

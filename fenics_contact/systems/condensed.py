@@ -125,7 +125,7 @@ class CondensedSystem(System):
         )
         self.coordinate_id = object()
         self.ready = True
-        self._full.diagonal = self._full.bulk_diagonal()
+        self._full.forget()
         return 1
 
     @property
@@ -204,12 +204,10 @@ class CondensedSystem(System):
 
     def forget(self) -> None:
         """Drop the solutions for earlier loads."""
-        self.diagonal[:] = 0.0
+        self._diagonal = None
         self._full.forget()
         if self._condensation is not None:
             self._condensation.forget()
-            # Reset also the entries of unknowns without contact stiffness.
-            self._full.diagonal = self._full.bulk_diagonal()
 
     def matrix(self, *, symmetric: bool) -> PETSc.Mat:
         """Create an operator for the sum of S and the contact tangents."""
@@ -247,7 +245,9 @@ class CondensedSystem(System):
         added = np.bincount(rows[on_diagonal], values[on_diagonal], minlength=len(schur))
         self.diagonal = self.bulk_diagonal() + scale * added
         # The round-off of contact forces depends on it.
-        self._full.diagonal[self.unknowns.retained] = self.unknowns.scatter(self.diagonal)
+        diagonal = self._full.diagonal
+        diagonal[self.unknowns.retained] = self.unknowns.scatter(self.diagonal)
+        self._full.diagonal = diagonal
         return 0
 
 

@@ -187,8 +187,8 @@ class FullSystem(System):
         return Forces(self.state(), bulk + self.load, self.load + reaction, self.label)
 
     def forget(self) -> None:
-        """Reset the diagonal, from which round-off is estimated."""
-        self.diagonal[:] = 0.0
+        """Discard the diagonal, from which round-off is estimated."""
+        self._diagonal = None
 
     def bulk_force(self) -> Array:
         """Return the residual of the bulk and of free obstacles. Collective."""

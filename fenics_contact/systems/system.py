@@ -44,7 +44,6 @@ class System(ABC):
         constrained: Mask of this rank's unknowns with Dirichlet conditions.
         prescribed: Values at them, in the present increment.
         load: External forces at the unknowns (force).
-        diagonal: Diagonal of the matrix assembled last (force/length).
         outside: Norms of load and `terms` at unknowns outside of the system, (2, n_bodies).
         label: Body or free obstacle of every unknown of this rank, (n_local,).
         n_bodies: Number of bodies and free obstacles.
@@ -75,7 +74,7 @@ class System(ABC):
         self.label, self.n_bodies = label, n_bodies
         self.prescribed: Array = np.zeros(int(constrained.sum()))
         self.load: Array = np.zeros(unknowns.n_local)
-        self.diagonal: Array = np.zeros(unknowns.n_local)
+        self._diagonal: Array | None = None  # of the matrix filled last
         self.outside: Array = np.zeros((2, n_bodies))
         self._motions = [motion for contact in contacts for motion in contact.motions]
         self._contact_vector = unknowns.vector()
@@ -90,6 +89,15 @@ class System(ABC):
     @abstractmethod
     def iterations_per_restart(self) -> int:
         """Iterations of L-BFGS between two assemblies of H₀."""
+
+    @property
+    def diagonal(self) -> Array:
+        """Diagonal of the matrix assembled last, or of the bulk (force/length). Collective."""
+        return self.bulk_diagonal() if self._diagonal is None else self._diagonal
+
+    @diagonal.setter
+    def diagonal(self, diagonal: Array) -> None:
+        self._diagonal = diagonal
 
     # ---- contact and force balance ---------------------------------------------------------------
 
