@@ -162,7 +162,7 @@ class IncrementSolver:
         if not skips_recovery:
             solver.system.complete(solver.system.pending_field)
         self.full.evaluate()
-        part = solver.system.part if skips_recovery else np.asarray
+        part = solver.system.restrict if skips_recovery else np.asarray
         if (
             reason > 0
             and move_unloaded_bodies(solver.equations, part)
@@ -279,7 +279,7 @@ class IncrementSolver:
         start, coordinate_id = state.energy, self.solver.system.coordinate_id
         if self.full.coordinate_id not in energies.forces and coordinate_id not in start.forces:
             # From rest, and on the retained dofs only: there are no forces at the start.
-            zero = Forces.none(np.zeros(1), np.zeros(1, dtype=np.intp))
+            zero = Forces.zero(np.zeros(1), np.zeros(1, dtype=np.intp))
             start = start.with_forces(coordinate_id, zero)
         if points.replaced:
             start = start.with_committed_jumps(self.full.contacts)
@@ -327,7 +327,7 @@ class IncrementSolver:
         return self.verifier.verify(
             system,
             bulk,
-            start=equations.start,
+            start=equations.initial_forces,
             rtol=equations.rtol,
             initial_unknowns=initial_unknowns,
             respond=self.solver.respond if kinematics else None,

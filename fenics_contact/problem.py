@@ -197,7 +197,7 @@ class ContactProblem:
             bulk = self.full.with_obstacles(self.full.bulk.assemble_residual())
             forces: dict[object, Forces] = {coordinate_id: self.full.present_forces(bulk)}
             return State(unknowns, contacts, load, EnergyState.at(forces, self.contacts), zero)
-        forces = {coordinate_id: Forces.none(unknowns, self.full.label)}
+        forces = {coordinate_id: Forces.zero(unknowns, self.full.label)}
         energy = EnergyState.unloaded(forces, self.contacts)
         return State(unknowns, contacts, zero, energy, zero)
 
@@ -365,7 +365,7 @@ class ContactProblem:
             raise_collectively(self._comm, error)
             reset()
             if not isinstance(error, NotConverged | ValueError):
-                self.solver.recover()
+                self.solver.recover_from_error()
             raise
         finally:
             if self._comm.rank == 0:
@@ -386,7 +386,7 @@ class ContactProblem:
         for contact in self.contacts:
             pairs = contact.states.committed.kinematics.pairs
             if (
-                not contact.contact_kinematics.follows
+                not contact.contact_kinematics.pairs_follow_bodies
                 and contact.pairs.jump_map is not pairs.jump_map
             ):
                 contact.states.restore()
@@ -610,7 +610,7 @@ class ContactProblem:
 
     def restart_solver(self) -> None:
         """Discard what the solver stores from earlier increments. Collective."""
-        self.solver.restart()
+        self.solver.clear_history()
         energy, coordinate_id = self.state.energy, self.full.coordinate_id
         forces = {coordinate_id: energy.forces[coordinate_id]}
         self.state = replace(self.state, energy=replace(energy, forces=forces))

@@ -96,11 +96,11 @@ def test_a_second_commit_finds_no_other_pairs():
         slide.value = way
         problem.solve()
         problem.commit()
-    pairings, rows = contact.pairs.number, contact.history.rows()
+    pairings, rows = contact.pairs.n_updates, contact.history.rows()
     before = contact.resultants()
     slide.value = 0.2
     problem.commit()
-    assert (contact.pairs.number, problem.increment) == (pairings, 2)
+    assert (contact.pairs.n_updates, problem.increment) == (pairings, 2)
     assert close(contact.history.rows(), rows, 0.0)
     assert close(contact.resultants().force, before.force, 0.0)
     step = problem.solve()

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from fenics_contact.systems.candidate_dofs import touched
+from fenics_contact.systems.candidate_dofs import find_coupled_dofs
 from fenics_contact.systems.condensation import Condensation
 from fenics_contact.systems.condensed import is_worthwhile
 from fenics_contact.systems.unknowns import DofSubset
@@ -74,7 +74,7 @@ def test_schur_complement(cell, degree, symmetric):
     assert problem.full.bulk.symmetric == symmetric
     K = dense(problem.full.bulk.stiffness)
     n, whole = len(K), problem.full.unknowns
-    touches = touched(problem.full.operators, whole)
+    touches = find_coupled_dofs(problem.full.operators, whole)
     # All components of all nodes of the bottom, no others.
     y = scene.u.function_space.tabulate_dof_coordinates()[:, scene.dim - 1]
     bottom = np.flatnonzero(np.repeat(np.abs(y) < 1e-12, scene.dim))

@@ -7,7 +7,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from fenics_contact.systems.dense import Sum, UpdatedLU
+from fenics_contact.systems.dense import SumOperator, UpdatedLU
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="dense matrices of one rank")
 N = 40
@@ -20,7 +20,7 @@ def scene(symmetric, seed=1):
     if symmetric:
         fixed = fixed + fixed.T
     fixed += 2 * np.eye(N)
-    operator = Sum()
+    operator = SumOperator()
     matrix = PETSc.Mat().createPython((N, N), operator, comm=PETSc.COMM_SELF)
     matrix.setUp()
     ksp = PETSc.KSP().create(PETSc.COMM_SELF)
@@ -60,8 +60,8 @@ def test_few_changes_are_corrections(size, monkeypatch):
     rng, fixed, matrix, ksp, operator = scene(True)
     made = []
     solver = ksp.pc.getPythonContext()
-    anew = solver.factor_anew
-    monkeypatch.setattr(solver, "factor_anew", lambda: made.append(1) or anew())
+    anew = solver.refactor
+    monkeypatch.setattr(solver, "refactor", lambda: made.append(1) or anew())
     diagonal = np.arange(N)
     added = np.where(diagonal < 25, size, 0.0)
     counts = []

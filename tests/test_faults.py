@@ -128,7 +128,9 @@ def test_snes_is_stopped(method, monkeypatch):
         survives(made, made.problem.solve, fc.NotConverged, "iteration limit reached")
     made.problem.solver.main.max_it = limit
     equations = made.problem.solver.equations
-    monkeypatch.setattr(equations, "solved", failing(equations.solved, 1, KeyboardInterrupt))
+    monkeypatch.setattr(
+        equations, "is_converged", failing(equations.is_converged, 1, KeyboardInterrupt)
+    )
     before = snapshot(made)
     with pytest.raises(KeyboardInterrupt):
         made.problem.solve()
@@ -143,7 +145,7 @@ def test_snes_is_stopped(method, monkeypatch):
 @pytest.mark.parametrize(
     ("kind", "name"),
     [
-        (dense.UpdatedLU, "factor_anew"),
+        (dense.UpdatedLU, "refactor"),
         (dense.UpdatedLU, "_solve"),
     ],
 )
@@ -227,7 +229,7 @@ def test_an_exception_in_a_linearised_solve(name, monkeypatch):
     """In the products and solutions of the error estimate: it comes out, and none comes after."""
     made, twin = pair("newton")
     made.problem.solve()
-    kind = dense.Sum if name == "product" else dense.UpdatedLU
+    kind = dense.SumOperator if name == "product" else dense.UpdatedLU
     with monkeypatch.context() as patch:
         patch.setattr(kind, name, failing(getattr(kind, name), 0))
         with pytest.raises(told(Fault), match="on purpose"):

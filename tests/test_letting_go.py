@@ -361,7 +361,7 @@ def test_a_body_that_is_thrown_out_is_told_of():
         blocks.displace(lambda x: 0.0 * x[:2], lambda x: x[:, 1] < 0.305)
         for contact in problem.contacts:
             contact.evaluate()
-        forces, start = problem.full.contact_forces(), problem.solver.equations.start
+        forces, start = problem.full.contact_forces(), problem.solver.equations.initial_forces
         found = find_ejected_bodies(problem.full, problem.motions, forces, before, start)
         assert [name.split(",")[0] for name in found] == names
         assert all(close(np.array(ways)[[0, 2]], [2.0, 0.0], 1e-12) for ways in found.values())
@@ -453,7 +453,7 @@ def test_a_body_that_a_floor_has_thrown_is_told_of(way):
     before = problem.full.state()
     u.interpolate(lambda x: np.vstack([way + 0.0 * x[0], 0.5 + 0.0 * x[0]]))
     scene.contact.evaluate()
-    forces, start = problem.full.contact_forces(), problem.solver.equations.start
+    forces, start = problem.full.contact_forces(), problem.solver.equations.initial_forces
     found = find_ejected_bodies(problem.full, problem.motions, forces, before, start)
     assert len(found) == (way > 3.0)
     expected = np.hypot(way, 0.5), 3.0, 1.0
@@ -481,7 +481,7 @@ def test_a_body_that_a_ball_has_thrown_off_a_wall_is_told_of():
     u.interpolate(lambda x: np.vstack([1.0 + 0.0 * x[0], 0.0 * x[0]]))
     for contact in contacts:
         contact.evaluate()
-    forces, start = problem.full.contact_forces(), problem.solver.equations.start
+    forces, start = problem.full.contact_forces(), problem.solver.equations.initial_forces
     found = find_ejected_bodies(problem.full, problem.motions, forces, before, start)
     assert [close(np.array(ways), (1.0, 0.06, 0.02), 1e-12) for ways in found.values()] == [True]
 
@@ -615,8 +615,8 @@ def test_friction_without_pressure_takes_a_block_along(n, modulus, kinematics, r
     assert np.abs(way - (0.01, 0.0)).max() < 1e-5
     if not rubber:  # which inverts by round-off there
         away = before + 1e10 * problem.motions.of_bodies[1]
-        assert np.isfinite(equations.residual_at(equations.system.part(away)))
-        assert not equations.norms.within(1e-9)
+        assert np.isfinite(equations.residual_at(equations.system.restrict(away)))
+        assert not equations.norms.is_within(1e-9)
 
 
 class Pushed:

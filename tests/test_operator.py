@@ -34,7 +34,7 @@ def read(operator: ContactOperator) -> list[np.ndarray]:
     operator.add_force(force, rng.normal(size=(n, gdim)))
     matrix = operator.springs(rng.normal(size=(n, gdim, gdim)))
     found = [operator.jump(rng.normal(size=unknowns.n_local)), force.array_r.copy()]
-    found += [operator.touched.copy(), *matrix.getValuesCSR()]
+    found += [operator.coupled_dofs.copy(), *matrix.getValuesCSR()]
     for item in (force, matrix):
         item.destroy()
     return found

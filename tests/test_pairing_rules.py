@@ -564,7 +564,7 @@ def test_true_gap(cell):
     body.displace(moved, lambda x: x[:, -1] > 0.5)
     x = contact.points
     gap, normal = contact.true_placement()
-    assert contact.pairs.number == 1
+    assert contact.pairs.n_updates == 1
     assert close(normal, np.tile(-turn[:, -1], (len(normal), 1)), 1e-12, scale=1.0)
     assert COMM.allreduce(np.count_nonzero(np.isnan(gap))) == 0
     height = (x + moved(x.T).T)[:, -1] - 0.5

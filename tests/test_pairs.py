@@ -251,5 +251,5 @@ def test_one_joint_slides_far_and_another_holds():
         assert close(r.force, [-0.2 * n, n], 1e-8)
         assert close(step.contacts["joint 1"].force, [-0.2 * n, n], 1e-7)
         assert step.contacts["joint 1"].stick > 0
-    assert slides.pairs.number > 1 and glued.pairs.number == 1
+    assert slides.pairs.n_updates > 1 and glued.pairs.n_updates == 1
     assert slides.n_unpaired == 0

@@ -538,8 +538,8 @@ def test_round_off_is_allowed_for_wherever_a_body_comes_to_be_touched():
         pair.place(pair.pressed(pair.nodes, 0.01, along))
         system.diagonal[:] = 1.0
         (operator,) = system.operators
-        touched.append(operator.touched)
-        assert (system.terms(at_rest)[operator.touched] > 0.5).all()
+        touched.append(operator.coupled_dofs)
+        assert (system.roundoff_magnitude(at_rest)[operator.coupled_dofs] > 0.5).all()
     new = np.setdiff1d(touched[1], touched[0]).size
     assert system.unknowns.comm.allreduce(new) > 0
 

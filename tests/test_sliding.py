@@ -114,11 +114,11 @@ def test_by_default_found_anew_once_points_slid_by_a_facet(condensation):
     numbers, forces = {}, {}
     for update, slider in made.items():
         slider.problem.small_displacement_tolerance = np.inf
-        first = slider.contact.pairs.number
+        first = slider.contact.pairs.n_updates
         numbers[update], forces[update] = [], []
         for way in ways:
             step = slider.step(0.002, way)
-            numbers[update].append(slider.contact.pairs.number - first)
+            numbers[update].append(slider.contact.pairs.n_updates - first)
             forces[update].append(step.contacts["contact"].force)
     assert numbers == {"never": [0] * 5, "auto": [0, 0, 1, 2, 3], "increment": [1, 2, 3, 4, 5]}
     never, auto, increment = (np.array(forces[update]) for update in made)
@@ -138,7 +138,7 @@ def test_found_anew_where_the_field_lags():
             steps.append(made.problem.solve(recover_interior=field))
             made.problem.commit()
         assert [step.complete for step in steps] == [True] * 4 if field else [False] * 3 + [True]
-        assert made.contact.pairs.number > 1
+        assert made.contact.pairs.n_updates > 1
         forces.append([step.contacts["contact"].force for step in steps])
     assert close(np.array(forces[1]), np.array(forces[0]), 1e-9)
 

@@ -294,7 +294,7 @@ def estimate_small_displacement_error(
 
 def _find_groups(contact: Contact, scales: ReferenceScales, number: int) -> list[_Group]:
     """Return the groups of a contact's points, the same on all ranks. Collective."""
-    masks = scales.parts_of(number)
+    masks = scales.points_by_group(number)
     force = contact.measure * np.linalg.norm(contact.traction, axis=1)
     forces = global_sum(contact.surface.mesh.comm, [force @ points for points in masks.values()])
     unloaded = forces <= scales.round_off_of_groups[list(masks)]

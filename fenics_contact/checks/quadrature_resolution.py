@@ -52,7 +52,7 @@ def warn_of_divided_facets(contact: Contact) -> bool:
 
     The position of its boundary is resolved to half of the distance between two points.
     """
-    if not contact.contact_kinematics.follows:
+    if not contact.contact_kinematics.pairs_follow_bodies:
         return False
     comm, points = contact.surface.mesh.comm, contact.quadrature.point_rows
     paired = contact.values.paired[points]

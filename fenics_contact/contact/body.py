@@ -157,7 +157,7 @@ class BodyFinite(BodySmall):
     """Finite sliding between bodies: the pairs follow the deformed bodies."""
 
     is_finite = True
-    follows = True
+    pairs_follow_bodies = True
 
     def __init__(self, parts: ContactParts) -> None:
         obstacle = parts.obstacle

@@ -435,7 +435,7 @@ class Contact(PointResults):
         multipliers = self._augmented()
         self.evaluate()
         error = multipliers.error(self.values, self.history, self.displacement_magnitude())
-        multipliers.take(multipliers.augmented(self.values)[1], self.values)
+        multipliers.assign(multipliers.augmented(self.values)[1], self.values)
         self.states.forget()
         return error
 

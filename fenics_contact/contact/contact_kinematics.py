@@ -155,14 +155,14 @@ class ContactKinematics(ABC):
         committed_angle: Rotation angle of the obstacle at the last commit (radians).
         is_finite: Whether the kinematics are finite.
         is_rigid: Whether the obstacle is rigid, so that its reactions are external forces.
-        follows: Whether pairs are updated with every change of the displacement.
+        pairs_follow_bodies: Whether pairs are updated with every change of the displacement.
         sampler: Evaluates a rigid obstacle at any position; None if it is known on Γc only, or with
             an opposing body.
     """
 
     is_finite = False
     is_rigid = True
-    follows = False
+    pairs_follow_bodies = False
     sampler: ObstacleSampler | None = None
 
     def __init__(

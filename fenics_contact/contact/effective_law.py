@@ -32,7 +32,9 @@ class EffectiveLaw:
         self._effective_law = self.own
         self._fixed_law: tuple[PointLaw, fem.Function] | None = None  # with its friction bound
         # Friction has no potential if the tangent planes rotate with u.
-        self._is_rotating = kinematics.follows or (kinematics.is_finite and law.has_tangential)
+        self._is_rotating = kinematics.pairs_follow_bodies or (
+            kinematics.is_finite and law.has_tangential
+        )
         self.has_potential = law.has_potential and not self._is_rotating
 
     @property

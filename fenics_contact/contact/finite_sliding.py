@@ -129,7 +129,7 @@ class FiniteSlidingPairs(Pairs):
         committed = self._committed
         _, tangents = side.positions(facet, xi, self._u)
         along, is_plane = _reciprocal(tangents)
-        self.degenerate = bool(self._mesh.comm.allreduce(int(not is_plane.all())))
+        self.is_degenerate = bool(self._mesh.comm.allreduce(int(not is_plane.all())))
         normal = side.outward_normals(facet, tangents)
         depth = self.search.largest(history.values("penetration"))
         if not global_max(self._mesh.comm, np.abs(self._committed_u.x.array)) > 0:
@@ -149,7 +149,7 @@ class FiniteSlidingPairs(Pairs):
         stretch = np.einsum("qji,qjk->qik", rotation, gradient)
         self._present = _Present(along, normal, gap, hits, total_slip, rotation, stretch)
         self._set_pairs(hits.matrix(self._u.function_space), paired)
-        if self.number == 1:
+        if self.n_updates == 1:
             self._warn_of_unpaired(hits.reason)
         self._local_map = None
 
@@ -171,7 +171,7 @@ class FiniteSlidingPairs(Pairs):
         self.local_jump.assign(fields)
 
     @cached_property
-    def reach(self) -> PETSc.Mat:
+    def coupling_map(self) -> PETSc.Mat:
         """Map from ``u`` to the nodes on the facets of both surfaces. Collective."""
         assert self.search is not None
         space, sides = self._u.function_space, (self._rays.slave, self._rays.master)

@@ -120,15 +120,15 @@ class Multipliers:
                 projected["traction"] -= self._excluded_part
         return projected
 
-    def tangential_change(self, values: PointValues) -> Array:
+    def tangential_update(self, values: PointValues) -> Array:
         """Return the change of λ_t by an augmentation, in the obstacle's frame. Collective."""
         self._excluded_part = None
         return np.asarray(
             self._next_multipliers(values)["traction"] - self.fields.values("traction")
         )
 
-    def leave_out(self, part: Array) -> None:
-        """Exclude a part from the next change of λ_t, until `tangential_change` or `restore`."""
+    def exclude(self, part: Array) -> None:
+        """Exclude a part from the next change of λ_t, until `tangential_update` or `restore`."""
         self._excluded_part = part
 
     def error(self, values: PointValues, history: PointFields, moved: Array) -> float:
@@ -167,12 +167,12 @@ class Multipliers:
         self._comm.Allreduce(MPI.IN_PLACE, maxima, op=MPI.MAX)
         return maxima
 
-    def shrink(self, factor: float) -> None:
+    def scale_pressure(self, factor: float) -> None:
         """Multiply λ_n by a factor before the augmentations; λ_t is not changed."""
         values = {name: self.fields.values(name) for name in ("pressure", *self._vectors)}
         self.fields.assign(values | {"pressure": factor * values["pressure"]})
 
-    def drop(self, unloaded: Mask) -> None:
+    def reset_unloaded(self, unloaded: Mask) -> None:
         """Set the multipliers of unloaded connected parts of Γc to zero. Collective."""
         is_loaded = self._largest(np.where(unloaded, 0.0, 1.0))[self._patch] > 0.0
         self.fields.set_rows(np.where(is_loaded[:, None], self.fields.rows(), 0.0))
@@ -187,13 +187,13 @@ class Multipliers:
         present = [self.fields.values(name) for name in projected]
         return np.stack([np.column_stack(present), np.column_stack(list(projected.values()))])
 
-    def take(self, rows: Array, values: PointValues) -> None:
+    def assign(self, rows: Array, values: PointValues) -> None:
         """Set λ_n and, with friction, λ_t, (n_points, 1 + gdim) (stress). Collective."""
         self.fields.assign(
             {"pressure": rows[:, 0], "traction": rows[:, 1:], "normal": values.framed_normal}
         )
 
-    def sizes(self, rows: Array) -> Array:
+    def largest_on_parts(self, rows: Array) -> Array:
         """Return the largest absolute value on the connected part of each point. Collective."""
         return self._largest(rows)[self._patch]
 

@@ -46,13 +46,13 @@ class Pairs:
             None if pairs follow the bodies.
         paired: Mask of this rank's points that have an opposite point, (n_points,).
         n_unpaired: Number of points without an opposite point, on all ranks.
-        number: Number of updates of the pairs.
+        n_updates: Number of updates of the pairs.
         distance: Distance to the opposite point, a function at the points.
         indicator: 1 at paired points, 0 at others, a function at the points.
         search: Search of the opposing surface.
         pairing_displacement, pairing_jump: Displacement in which the pairs were found, and its
             jump, (n_points, gdim) (length); None for the undeformed bodies.
-        degenerate: Whether Γc has no tangent plane at a point of any rank, in a diverged trial
+        is_degenerate: Whether Γc has no tangent plane at a point of any rank, in a diverged trial
             state of pairs that follow the bodies.
     """
 
@@ -66,13 +66,13 @@ class Pairs:
         self.jump_map: PETSc.Mat = self.own_map
         self.opposite_map: PETSc.Mat | None = None
         self.paired = np.ones(quadrature.n_points, dtype=np.bool_)
-        self.n_unpaired = self.number = 0
+        self.n_unpaired = self.n_updates = 0
         self.search: Pairing | None = None
         self.distance: fem.Function | None = None
         self.indicator: fem.Function | None = None
         self.pairing_displacement: fem.Function | None = None
         self.pairing_jump: Array | None = None
-        self.degenerate = False
+        self.is_degenerate = False
         if isinstance(obstacle, DeformableBody):
             self.search = Pairing(obstacle, quadrature, u.function_space)
             self.distance = fem.Function(quadrature.space(), name="distance")
@@ -91,7 +91,7 @@ class Pairs:
         self._set_pairs(opposite, ~np.isnan(distance))
         self.pairing_displacement = None if u is None else u.copy()
         self.pairing_jump = None if u is None else self._product(self.jump_map, u)
-        if self.number == 1:  # later, bodies that slide off each other have more and more
+        if self.n_updates == 1:  # later, bodies that slide off each other have more and more
             self._warn_of_unpaired(reasons)
 
     def _set_pairs(self, opposite: PETSc.Mat, paired: Mask) -> None:
@@ -108,7 +108,7 @@ class Pairs:
         opposite.destroy()
         mask.destroy()
         self.jump_map = jump_map
-        self.number += 1
+        self.n_updates += 1
         self.n_unpaired = int(global_sum(self._mesh.comm, np.count_nonzero(~paired)))
 
     def _warn_of_unpaired(self, reasons: Index) -> None:
@@ -145,13 +145,13 @@ class Pairs:
             state.pairing_displacement,
             state.pairing_jump,
         )
-        self.number += 1  # results of the pairs in between are out of date
+        self.n_updates += 1  # results of the pairs in between are out of date
         self.distance.x.array[:] = state.distance
         self.indicator.x.array[: self._quadrature.n_points] = self.paired
         self.indicator.x.scatter_forward()
 
     @property
-    def reach(self) -> PETSc.Mat:
+    def coupling_map(self) -> PETSc.Mat:
         """Map from ``u`` whose columns are the dofs that the pairs may couple. Collective."""
         return self.jump_map
 

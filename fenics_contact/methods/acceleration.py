@@ -54,7 +54,9 @@ class Acceleration:
         last = np.concatenate(padded, axis=1)
         # Residuals are relative to the tractions of their part of Γc, like the enforcement error.
         results = zip(self._augmented, pairs, strict=True)
-        sizes = np.concatenate([multipliers.sizes(pair[1]) for (_, multipliers), pair in results])
+        sizes = np.concatenate(
+            [multipliers.largest_on_parts(pair[1]) for (_, multipliers), pair in results]
+        )
         largest = np.zeros(len(self._sequences))
         np.maximum.at(largest, self._group, sizes)
         self._comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
@@ -68,7 +70,7 @@ class Acceleration:
         for (contact, multipliers), part in zip(
             self._augmented, np.split(next_multipliers, self._ends), strict=True
         ):
-            multipliers.take(part, contact.values)
+            multipliers.assign(part, contact.values)
             contact.states.forget()
 
     def _combine(self, sequence: list[Array], weights: Array) -> Array:

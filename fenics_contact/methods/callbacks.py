@@ -154,8 +154,8 @@ class Callbacks:
                 del error  # its traceback refers to this frame, which refers to the solvers
         dense.raise_stored_error(snes.getKSP())
         reason, pc = snes.getConvergedReason(), snes.getKSP().getPC()
-        out_of_memory = reason <= 0 and self._comm.allreduce(linear.refused_memory(pc))
-        linear.forget_failure(pc)
+        out_of_memory = reason <= 0 and self._comm.allreduce(linear.is_out_of_memory(pc))
+        linear.reset_failed_factorisation(pc)
         if out_of_memory:
             raise MemoryError(
                 "out of memory in a factorisation: use more ranks, linear_solver='multigrid', or "

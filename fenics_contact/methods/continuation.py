@@ -57,7 +57,7 @@ class Continuation(StandaloneMethod):
         # Softer in any case, since Newton's method has failed at full stiffness.
         soft = 1.0 / max(equations.stiffness_ratio(), _INITIAL_FACTOR)
         equations.residual(equations.solution, equations.function)
-        near = equations.solved(_SOFT_RTOL)
+        near = equations.is_converged(_SOFT_RTOL)
         ratio = 1.0 if near else soft
         iterations, solved, factor, last = 0, 0.0, _INITIAL_FACTOR, equations.solution.copy()
         try:

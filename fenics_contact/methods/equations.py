@@ -81,7 +81,7 @@ class Equations:
         self.monitor = ActiveSetMonitor(full.contacts)
         zeros: Array = np.zeros(full.n_bodies)
         self.norms = Norms(zeros, zeros, zeros, zeros, zeros.size)
-        self.start = InitialForces(zeros, np.zeros((len(full.contacts), full.n_bodies)))
+        self.initial_forces = InitialForces(zeros, np.zeros((len(full.contacts), full.n_bodies)))
         self.rtol = self.augmentation_rtol = 0.0
         self.solvers: dict[bool, PETSc.KSP] = {}
         self.uses_v_cycle, self.hierarchy = False, Hierarchy()
@@ -123,7 +123,7 @@ class Equations:
         system = self.system
         # No force acts on an ejected body: Newton's method would converge there.
         ejected = system is self.full and find_ejected_bodies(
-            self.full, self.motions, contacts, self.initial_unknowns, self.start
+            self.full, self.motions, contacts, self.initial_unknowns, self.initial_forces
         )
         if (
             ejected
@@ -132,11 +132,11 @@ class Equations:
             or system.is_degenerate()
         ):
             total[:] = np.nan  # a line search takes a shorter step
-        self.norms = self.system.norms(total, contacts, self.start)
+        self.norms = self.system.norms(total, contacts, self.initial_forces)
         # The line search must not follow the round-off of a stiff body. After a restart it is
         # unknown until a matrix is assembled.
         left_out = self.norms.is_round_off & self.is_round_off_known
-        self.norms = self.norms.without(left_out)
+        self.norms = self.norms.exclude(left_out)
         total[self.system.constrained | left_out[self.system.label]] = 0.0
         f.array[:] = total / (self._bulk.scale * self.length)
         return self.norms
@@ -156,14 +156,14 @@ class Equations:
     def energy_size(self) -> float:
         """Sum the absolute values of the terms of `energy` at the present state. Collective."""
         state = self.system.state()
-        size = float(np.abs(self.system.terms(state) * state).sum())
+        size = float(np.abs(self.system.roundoff_magnitude(state) * state).sum())
         size += float(np.abs(self.system.load * state).sum())
         total = float(global_sum(self._comm, size + sum(abs(c.energy()) for c in self.contacts)))
         return total / (self._bulk.scale * self.length**2)
 
-    def solved(self, rtol: float = 0.0) -> bool:
+    def is_converged(self, rtol: float = 0.0) -> bool:
         """Return whether the last residual is within the present tolerance, or ``rtol``."""
-        return self.norms.within(max(self.rtol, self.augmentation_rtol, rtol))
+        return self.norms.is_within(max(self.rtol, self.augmentation_rtol, rtol))
 
     def find_overload(self) -> Overload | None:
         """Find an overload of friction at the last pressures, for a linear bulk. Collective."""

@@ -115,7 +115,7 @@ def _divide_contacts(full: FullSystem) -> list[_Part]:
         _Part(contact, points, group)
         for number, contact in enumerate(full.contacts)
         if contact.law.has_friction
-        for group, points in full.scales.parts_of(number).items()
+        for group, points in full.scales.points_by_group(number).items()
     ]
 
 

@@ -104,7 +104,7 @@ class InitialPositioning:
                 full.evaluate_at(self.before)
                 untouched = np.union1d(untouched, self._find_untouched())
             full.evaluate_at(present)
-        if len(untouched) < len(motions.free) and motions.turning:
+        if len(untouched) < len(motions.free) and motions.has_obstacle_rotations:
             # With touching bodies freely rotating obstacles are left to the iteration.
             untouched = untouched[motions.of_any_body()[untouched]]
         modes = np.union1d(untouched, np.flatnonzero(unloaded))

@@ -78,7 +78,7 @@ def find_overload(
         rotating obstacles, finite kinematics, unlimited tangential forces, or friction bounds that
         depend on the motion.
     """
-    if motions.turning:
+    if motions.has_obstacle_rotations:
         return None
     (resultant, _), groups = motions.load_resultant(load, operators), motions.groups()
     overloads: list[Overload] = []

@@ -68,7 +68,7 @@ def linearised_solver(
                 "the linearised problem at the solution did not converge (KSP reason "
                 f"{ksp.getConvergedReason()}); use linear_solver='direct'"
             )
-        return system.extended(solution.array_r.copy())
+        return system.extend(solution.array_r.copy())
 
     try:
         matrices = (o.springs(s) for o, s in zip(system.operators, springs, strict=True))
@@ -81,7 +81,7 @@ def linearised_solver(
         ksp.setTolerances(rtol=1e-8, max_it=1000)
         yield solve
     finally:
-        linear.forget_failure(equations.solvers[True].getPC())
+        linear.reset_failed_factorisation(equations.solvers[True].getPC())
         for item in (ksp, rhs, solution):
             item.destroy()
 

@@ -42,7 +42,7 @@ def find_free_modes(modes: RigidBodyModes, full: FullSystem) -> None:
     with full.stiffness_at_rest() as stiffness:
         full.scales.measure_stiffness(stiffness)
         modes.find_free(stiffness, full.constrained)
-    unconstrained = modes.unconstrained(full.operators, closed_only=False) @ modes.free
+    unconstrained = modes.find_unconstrained(full.operators, closed_only=False) @ modes.free
     if unconstrained.size:
         motions = "; ".join(modes.describe(row) for row in unconstrained)
         finite = any(contact.finite for contact in full.contacts)
@@ -69,7 +69,9 @@ def check_balance(modes: RigidBodyModes, load: Array, operators: Sequence[Contac
     Raises:
         ValueError: The load cannot be balanced; with the resultant and the mode.
     """
-    rows = modes.straight()  # lever arms change with the rotation of an obstacle
+    rows = (
+        modes.find_state_independent_modes()
+    )  # lever arms change with the rotation of an obstacle
     resultant, size = modes.load_resultant(load, operators)
     if not resultant.any():
         return

@@ -108,9 +108,9 @@ class StandaloneMethod(Method):
     """A method with its own nonlinear solvers, registered in `METHODS`.
 
     `solve` starts from ``equations.solution`` and overwrites it, and restores the data of the
-    contacts; it has converged if ``equations.solved()`` after ``equations.residual``. Newton's
-    method of `SolverContext.newton` does both: call `Newton.attach` before every solution, and
-    return the result of its ``solve``. It fails after 14 iterations without a lower residual
+    contacts; it has converged if ``equations.is_converged()`` after ``equations.residual``.
+    Newton's method of `SolverContext.newton` does both: call `Newton.attach` before every solution,
+    and return the result of its ``solve``. It fails after 14 iterations without a lower residual
     (`ActiveSetMonitor.n_stalled`), so that another method can take over.
 
     Attributes:
@@ -208,7 +208,7 @@ class SnesMethod(Method):
 
     def converged(self) -> int:
         """Return the SNES reason of the convergence test, or that SNES iterates."""
-        if self._equations.solved(self.coarse_rtol):
+        if self._equations.is_converged(self.coarse_rtol):
             return int(_REASONS.CONVERGED_FNORM_RELATIVE)
         if self._equations.monitor.n_stalled > _MAX_STALLED_ITERATIONS and self.can_hand_over():
             return int(_REASONS.DIVERGED_LINE_SEARCH)
@@ -324,7 +324,7 @@ class Newton(SnesMethod):
         ksp, correction = self.snes.getKSP(), f.duplicate()
         ksp.solve(f, correction)
         solved = ksp.getConvergedReason() > 0
-        linear.forget_failure(ksp.getPC())
+        linear.reset_failed_factorisation(ksp.getPC())
         size = correction.norm() if solved else np.inf
         correction.destroy()
         return float(size)

@@ -112,12 +112,14 @@ class Predictor:
         equations, system = self._equations, self._equations.system
         present: Array = system.state()
         # The residual retains the round-off of the terms at the first initial guess.
-        terms: Array = system.by_body(system.terms(present))[0]
+        terms: Array = system.by_body(system.roundoff_magnitude(present))[0]
         terms = np.asarray(np.hypot(terms, system.outside[1]), dtype=np.float64)
         # The last matrix may be that of an overflowing step.
         terms = np.where(np.isfinite(terms), terms, 0.0)
-        initial_forces = equations.start
-        equations.start = replace(initial_forces, terms=np.maximum(initial_forces.terms, terms))
+        initial_forces = equations.initial_forces
+        equations.initial_forces = replace(
+            initial_forces, terms=np.maximum(initial_forces.terms, terms)
+        )
         candidates: list[Array] = []
         residuals: list[float] = []
 
@@ -152,7 +154,7 @@ class Predictor:
         if first_augmentation and not predicts and not cold and self.change is not None:
             add(self._extrapolate(present, forces, self.change))
         if self.expected is not None and first_augmentation:
-            add(system.part(self.expected))
+            add(system.restrict(self.expected))
         if (
             step is not None
             and not is_reversed
@@ -167,7 +169,7 @@ class Predictor:
         The secant over the whole increment makes the result independent of its size.
         """
         equations, system = self._equations, self._equations.system
-        path = system.part(change).copy()
+        path = system.restrict(change).copy()
         path[system.constrained] = 0.0
         equations.residual_at(present + path)
         work = np.array([forces @ path, equations.function.array_r @ path])
@@ -222,7 +224,7 @@ class Predictor:
         image.scale(-1.0 / full.bulk.scale)
         ksp.solve(image, step)
         solved = ksp.getConvergedReason() > 0
-        linear.forget_failure(ksp.getPC())
+        linear.reset_failed_factorisation(ksp.getPC())
         full.set_state(present)
         full.update_stiffness()
         if not solved:
@@ -257,7 +259,7 @@ class Predictor:
         ksp.solve(forces, step)
         dense.raise_stored_error(ksp)
         solved = ksp.getConvergedReason() > 0
-        linear.forget_failure(ksp.getPC())
+        linear.reset_failed_factorisation(ksp.getPC())
         increment: Array = -step.array_r
         for vector in (forces, step):
             vector.destroy()
@@ -299,12 +301,12 @@ class Predictor:
         large. They become the least ones without penetration by the rest of the step.
         """
         equations, full, motions = self._equations, self._equations.full, self._equations.motions
-        modes = motions.in_free(equations.regularised_modes)
+        modes = motions.project_on_free(equations.regularised_modes)
         if not len(modes):
             return step
         comm = full.unknowns.comm
         free = [np.where(full.constrained, 0.0, field) for field in motions.present_fields()]
-        all_modes = np.array([system.part(field) for field in free])
+        all_modes = np.array([system.restrict(field) for field in free])
         fields = modes @ all_modes
         sums = global_sum(comm, np.column_stack([fields @ fields.T, fields @ step]))
         coefficients = broadcast_from_root(

@@ -83,7 +83,7 @@ class QuasiNewton(SnesMethod):
             snes.setTolerances(max_it=min(equations.system.iterations_per_restart, remaining))
             iterations += self._callbacks.solve(snes, solution)[0]
             residual = equations.residual(solution, equations.function).total
-            if equations.solved():
+            if equations.is_converged():
                 return iterations, int(_REASONS.CONVERGED_FNORM_RELATIVE)
             if iterations >= limit:
                 return iterations, int(_REASONS.DIVERGED_MAX_IT)

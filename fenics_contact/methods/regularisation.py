@@ -69,10 +69,10 @@ class UnconstrainedModes:
         """
         n = len(motions.free)
         ratio, groups = np.full(scales.n_groups, np.nan), motions.groups()
-        free_modes = motions.unconstrained(operators, closed_only=True, slips=True)
+        free_modes = motions.find_unconstrained(operators, closed_only=True, slips=True)
         if not len(free_modes) and not unloaded.any():
             return cls(ratio, unloaded, np.zeros((0, n)), np.zeros(0), np.zeros(0, dtype=np.intp))
-        open_modes = motions.unconstrained(operators, closed_only=True)
+        open_modes = motions.find_unconstrained(operators, closed_only=True)
         is_open = unloaded.copy()
         is_open[groups[np.argmax(np.abs(open_modes), axis=1)]] = True
         free_modes = np.concatenate([free_modes, np.eye(n)[unloaded[groups]]])

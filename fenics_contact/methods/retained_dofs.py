@@ -6,7 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fenics_contact.systems.candidate_dofs import active_points, distances, nearest, touched
+from fenics_contact.systems.candidate_dofs import (
+    compute_contact_distances,
+    find_active_points,
+    find_coupled_dofs,
+    select_nearest_dofs,
+)
 from fenics_contact.systems.condensed import is_worthwhile, n_inexpensive, should_retain_all
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
@@ -53,7 +58,7 @@ class RetainedDofs:
 
     def find_coupled(self) -> Indices:
         """Find the local unknowns that contact couples with the present pairs. Collective."""
-        return touched(self._full.operators, self._full.unknowns)
+        return find_coupled_dofs(self._full.operators, self._full.unknowns)
 
     def _count(self, indices: Indices) -> int:
         return int(self._full.unknowns.comm.allreduce(indices.size))
@@ -70,9 +75,9 @@ class RetainedDofs:
             return coupled
         if gaps is None:
             self._full.evaluate()
-            gaps = [distances(contact) for contact in self._full.contacts]
+            gaps = [compute_contact_distances(contact) for contact in self._full.contacts]
         n_cheap = n_inexpensive(self._full.unknowns.n_global, self._full.gdim)
-        return nearest(
+        return select_nearest_dofs(
             self._full.operators,
             self._full.unknowns,
             gaps,
@@ -123,8 +128,8 @@ class RetainedDofs:
             if comm.allreduce(int(not np.array_equal(indices, self.indices))):
                 self._next = indices
         elif other_pairs and not self.is_all:
-            active = [active_points(contact) for contact in self._full.contacts]
-            required = touched(self._full.operators, self._full.unknowns, active)
+            active = [find_active_points(contact) for contact in self._full.contacts]
+            required = find_coupled_dofs(self._full.operators, self._full.unknowns, active)
             if comm.allreduce(np.setdiff1d(required, self.indices).size):
                 self._next = self._select_more(None, can_drop=True)
         return self._next is not None
@@ -139,9 +144,13 @@ class RetainedDofs:
         acts_outside = False
         for operator in operators:
             if operator.within is not None:
-                acts_outside |= bool(np.any(active_points(operator.contact) & ~operator.within))
+                acts_outside |= bool(
+                    np.any(find_active_points(operator.contact) & ~operator.within)
+                )
         self._next = None
-        self._distances = [distances(c) for c in self._full.contacts] if has_solution else None
+        self._distances = (
+            [compute_contact_distances(c) for c in self._full.contacts] if has_solution else None
+        )
         return bool(self._full.unknowns.comm.allreduce(int(acts_outside)))
 
     def update(self, *, can_drop: bool) -> None:

@@ -336,7 +336,10 @@ class Solver:
 
     def _present_pairings(self) -> list[int]:
         # With finite kinematics the matrices are always assembled again.
-        return [0 if c.contact_kinematics.follows else c.pairs.number for c in self._full.contacts]
+        return [
+            0 if c.contact_kinematics.pairs_follow_bodies else c.pairs.n_updates
+            for c in self._full.contacts
+        ]
 
     def is_current(self) -> bool:
         """Return whether bulk and pairs are those of the last solution. Collective."""
@@ -398,12 +401,12 @@ class Solver:
             self._reconfigure()
         self._retained.is_selected = True
 
-    def restart(self) -> None:
+    def clear_history(self) -> None:
         """Delete data of earlier increments. Collective."""
         self.system.forget()
         self._reset_matrices()
 
-    def recover(self) -> None:
+    def recover_from_error(self) -> None:
         """Replace vectors and matrices left locked or incomplete by a PETSc error. Collective."""
         self.equations.set_system(self.system)
         self._reset_matrices()
@@ -442,7 +445,7 @@ class Solver:
             Reason of the last solution, attempts, and number of solutions.
         """
         equations = self.equations
-        equations.start = self.system.initial_forces()
+        equations.initial_forces = self.system.initial_forces()
         equations.is_round_off_known, equations.overload = False, None
         equations.generalised_loads = equations.motions.generalised_load(self._full.load)
 

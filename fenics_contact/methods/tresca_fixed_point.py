@@ -106,7 +106,7 @@ class TrescaFixedPoint(StandaloneMethod):
                 self._search.atol = self._finish.atol = rtol * residual
                 iterations += self._minimise()
                 residual = self._compute_residual_norm()
-                if equations.solved():
+                if equations.is_converged():
                     logger.debug("%d cycles, %d Newton iterations", cycle + 1, iterations)
                     return iterations, int(_REASONS.CONVERGED_FNORM_RELATIVE)
                 stalls = 0 if residual < best else stalls + 1
@@ -195,7 +195,7 @@ class _Minimisation(SnesMethod):
     def converged(self) -> int:
         """Return the SNES reason of the convergence test."""
         equations = self._equations
-        converged = equations.norms.total <= self.atol or equations.solved()
+        converged = equations.norms.total <= self.atol or equations.is_converged()
         return int(_REASONS.CONVERGED_FNORM_RELATIVE if converged else _REASONS.ITERATING)
 
     def _compute_jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
@@ -239,7 +239,7 @@ class _Search(_Minimisation):
     def converged(self) -> int:
         """Return the SNES reason, also an end at the round-off of the energy. Collective."""
         reason, ongoing = super().converged(), int(_REASONS.ITERATING)
-        if reason == ongoing and self._equations.solved(_LINE_SEARCH_RTOL):
+        if reason == ongoing and self._equations.is_converged(_LINE_SEARCH_RTOL):
             return int(_REASONS.DIVERGED_LINE_SEARCH)
         if reason != ongoing or not np.isfinite(self._energy):
             return reason

@@ -42,7 +42,7 @@ def move_unloaded_bodies(equations: Equations, part: Callable[[Array], Array]) -
     modes = motions.find_unloaded(full.operators, [committed, present])
     # Not bodies displaced by Dirichlet conditions.
     change = np.where(full.constrained, full.state() - equations.initial_unknowns, 0.0)
-    modes = modes[~motions.move_any(modes, full.scales.largest(change) > 0.0)]
+    modes = modes[~motions.find_modes_moving(modes, full.scales.largest(change) > 0.0)]
     groups = motions.groups()[np.argmax(np.abs(modes), axis=1)] if len(modes) else np.zeros(0)
     results = [
         _minimise_motion(equations, part, modes[groups == n], int(n)) for n in np.unique(groups)
@@ -75,14 +75,14 @@ def _minimise_motion(
     for contact, points in zip(full.contacts, active, strict=True):
         if contact.multipliers is not None:
             multipliers.append((contact.multipliers, contact.multipliers.fields.rows()))
-            contact.multipliers.drop(np.all(~points, axis=0))
-    equations.residual_at(system.part(full.state()))
+            contact.multipliers.reset_unloaded(np.all(~points, axis=0))
+    equations.residual_at(system.restrict(full.state()))
     full.evaluate_at(full.state())
     augmented = [contact for contact in full.contacts if contact.multipliers is not None]
-    if equations.solved() and all(c.enforcement_error() <= c.tolerance for c in augmented):
+    if equations.is_converged() and all(c.enforcement_error() <= c.tolerance for c in augmented):
         return True
     for each, rows in multipliers:
         each.fields.set_rows(rows)
-    equations.residual_at(system.part(solution))
+    equations.residual_at(system.restrict(solution))
     full.evaluate_at(solution)
     return False

@@ -78,7 +78,7 @@ class Norms:
         finite = np.isfinite(self.residual) & np.isfinite(self.force) & np.isfinite(self.floor)
         return np.where(finite & ~np.isnan(ratio), ratio, np.inf)
 
-    def within(self, rtol: float) -> bool:
+    def is_within(self, rtol: float) -> bool:
         """Return whether the residual of every part is within its tolerance."""
         return bool(np.all(self.excess(rtol) <= 1.0))
 
@@ -87,7 +87,7 @@ class Norms:
         """Mask of the bodies whose residual is round-off only, (n_bodies,)."""
         return np.asarray(self.residual <= self.floor)[: self.n_bodies]
 
-    def without(self, bodies: Mask) -> Norms:
+    def exclude(self, bodies: Mask) -> Norms:
         """Return a copy with zero residuals of the bodies in a mask, (n_bodies,)."""
         residual = self.residual.copy()
         residual[: self.n_bodies][bodies] = 0.0

@@ -18,10 +18,15 @@ from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array, Indices, Mask
 
-__all__ = ["active_points", "distances", "nearest", "touched"]
+__all__ = [
+    "compute_contact_distances",
+    "find_active_points",
+    "find_coupled_dofs",
+    "select_nearest_dofs",
+]
 
 
-def active_points(contact: Contact) -> Mask:
+def find_active_points(contact: Contact) -> Mask:
     """Return the mask of this rank's active points, (n_points,), as evaluated.
 
     A point with a given friction bound is active even if its gap is open.
@@ -32,17 +37,17 @@ def active_points(contact: Contact) -> Mask:
     return np.asarray((contact.status != Status.OPEN) | (acts & contact.paired))
 
 
-def distances(contact: Contact) -> Array:
+def compute_contact_distances(contact: Contact) -> Array:
     """Return the distance of this rank's points from contact, (n_points,) (length).
 
     It is -∞ at active points, and at all points if the gap is prescribed, since the gap is then not
     closed by displacements. It is ∞ at points without an opposite point.
     """
     gap = np.where(contact.paired, contact.values.gap, np.inf)
-    return np.where(active_points(contact) | contact.gap_prescribed, -np.inf, gap)
+    return np.where(find_active_points(contact) | contact.gap_prescribed, -np.inf, gap)
 
 
-def touched(
+def find_coupled_dofs(
     operators: Sequence[ContactOperator],
     unknowns: Unknowns,
     points: Sequence[Mask] | None = None,
@@ -59,7 +64,7 @@ def touched(
     return np.flatnonzero(coupled).astype(np.int32)
 
 
-def nearest(
+def select_nearest_dofs(
     operators: Sequence[ContactOperator],
     unknowns: Unknowns,
     away: Sequence[Array],
@@ -77,7 +82,7 @@ def nearest(
             (length).
     """
     comm = unknowns.comm
-    all_dofs = touched(operators, unknowns)
+    all_dofs = find_coupled_dofs(operators, unknowns)
     n_coupled = int(comm.allreduce(all_dofs.size))
     order = np.sort(gather_rows(comm, np.concatenate(away)))
     n_active = int(np.count_nonzero(order == -np.inf))
@@ -87,6 +92,6 @@ def nearest(
     while n_dofs > wanted and n_points > n_active:
         n_points = max(n_active, min(n_points * wanted // n_dofs, n_points - 1))
         cutoff = order[n_points - 1] + round_off if n_points else -np.inf
-        dofs = touched(operators, unknowns, [a <= cutoff for a in away])
+        dofs = find_coupled_dofs(operators, unknowns, [a <= cutoff for a in away])
         n_dofs = int(comm.allreduce(dofs.size))
     return dofs

@@ -14,7 +14,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact.systems.condensation import Condensation
-from fenics_contact.systems.dense import Sum, UpdatedLU
+from fenics_contact.systems.dense import SumOperator, UpdatedLU
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.system import System
@@ -147,7 +147,7 @@ class CondensedSystem(System):
         self.u.x.scatter_forward()
         self.set_motions(state)
 
-    def part(self, state: Array) -> Array:
+    def restrict(self, state: Array) -> Array:
         """Restrict a state of all unknowns to the retained ones. Collective."""
         return self.unknowns.gather(state[self.unknowns.retained])
 
@@ -156,14 +156,14 @@ class CondensedSystem(System):
         self._full.begin(load)
         state = self._full.state()
         self.condensation.set_load(load, state)
-        self.load = self.part(load)
+        self.load = self.restrict(load)
         self.prescribed = self.state()[self.constrained]
-        outside = load.copy(), self._full.terms(state)
+        outside = load.copy(), self._full.roundoff_magnitude(state)
         for vector in outside:
             vector[self.unknowns.retained] = 0.0
         self.outside = self._full.by_body(*outside)
 
-    def extended(self, change: Array) -> Array:
+    def extend(self, change: Array) -> Array:
         """Extend a change to all unknowns by one back-substitution. Collective."""
         return self.condensation.extend(change)
 
@@ -213,7 +213,7 @@ class CondensedSystem(System):
         """Create an operator for the sum of S and the contact tangents."""
         n = self.unknowns.n_local
         size = (n, None)
-        matrix = PETSc.Mat().createPython((size, size), Sum(), comm=self.unknowns.comm)
+        matrix = PETSc.Mat().createPython((size, size), SumOperator(), comm=self.unknowns.comm)
         matrix.setUp()
         return matrix
 

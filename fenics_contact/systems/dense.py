@@ -14,7 +14,7 @@ from petsc4py import PETSc
 from fenics_contact.parallel import broadcast_from_root, collective_errors
 from fenics_contact.types import Array, Index
 
-__all__ = ["Sum", "UpdatedLU", "raise_stored_error"]
+__all__ = ["SumOperator", "UpdatedLU", "raise_stored_error"]
 
 
 # Largest ratio of changed unknowns to all up to which the factors are updated.
@@ -23,7 +23,7 @@ _MAX_UPDATE_RATIO = 0.25
 _UPDATE_RTOL = 1e-11
 
 
-class Sum:
+class SumOperator:
     """Context of a PETSc Mat, S + C.
 
     Attributes:
@@ -82,7 +82,7 @@ class UpdatedLU:
 
     def __init__(self) -> None:
         self.error: BaseException | None = None
-        self._operator = Sum()
+        self._operator = SumOperator()
         empty: Array = np.zeros((0, 0))
         no_dofs: Index = np.zeros(0, dtype=np.intp)
         # LU factors of S + C; S, and rows, columns and values of C at that time.
@@ -110,14 +110,14 @@ class UpdatedLU:
         self._operator = pc.getOperators()[1].getPythonContext()
         try:
             # Only the first rank has unknowns.
-            regular = not len(self._operator.fixed) or self._update_low_rank() or self.factor_anew()
+            regular = not len(self._operator.fixed) or self._update_low_rank() or self.refactor()
         except BaseException as error:
             self.error, regular = self.error or error, False
             self._factored = None
         regular = broadcast_from_root(pc.comm.tompi4py(), regular)
         pc.setFailedReason(reasons.NOERROR if regular else reasons.FACTOR_NUMERIC_ZEROPIVOT)
 
-    def factor_anew(self) -> bool:
+    def refactor(self) -> bool:
         """Factor S + C; return whether it is regular."""
         fixed, (rows, columns, values) = self._operator.fixed, self._operator.added
         whole = fixed.copy(order="F")
@@ -180,7 +180,7 @@ class UpdatedLU:
         solution -= self._changed_columns @ (self._change @ at_changed)
         residual = right - self._operator.product(solution)
         if not np.linalg.norm(residual) <= _UPDATE_RTOL * np.linalg.norm(right):
-            self.factor_anew()
+            self.refactor()
             return scipy.linalg.lu_solve(self._factor, right, check_finite=False)
         return solution
 

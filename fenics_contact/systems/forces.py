@@ -27,6 +27,6 @@ class Forces:
     label: Index
 
     @classmethod
-    def none(cls, unknowns: Array, label: Index) -> Forces:
+    def zero(cls, unknowns: Array, label: Index) -> Forces:
         """Return zero forces at a state."""
         return cls(unknowns, np.zeros_like(unknowns), np.zeros_like(unknowns), label)

@@ -163,13 +163,13 @@ class FullSystem(System):
         cells = np.arange(mesh.topology.index_map(mesh.topology.dim).size_local, dtype=np.int32)
         return global_max(mesh.comm, mesh.h(mesh.topology.dim, cells))
 
-    def terms(self, state: Array) -> Array:
+    def roundoff_magnitude(self, state: Array) -> Array:
         """Return the magnitude of the terms of K u, (n_local,) (force). Collective.
 
         A nonlinear bulk evaluates I + ∇u, whose round-off is that of 1 even at rest. The equations
         of other fields, such as an incompressibility constraint, sum up displacements.
         """
-        terms = super().terms(state)
+        terms = super().roundoff_magnitude(state)
         if not self.bulk.linear:
             terms = terms + self.diagonal * self._cell_size
         if not self.displacement.is_mixed:
@@ -232,7 +232,7 @@ class FullSystem(System):
     @property
     def follows(self) -> bool:
         """Whether the pairs of a contact are updated with the displacement."""
-        return any(contact.contact_kinematics.follows for contact in self.contacts)
+        return any(contact.contact_kinematics.pairs_follow_bodies for contact in self.contacts)
 
     @property
     def pattern_changes(self) -> bool:

@@ -48,7 +48,10 @@ class Hierarchy:
         """
         pc, present = ksp.getPC(), (stiffness.handle, stiffness.stateGet())
         if self._rows is None:
-            coupled = [np.empty(0, dtype=np.int32), *(operator.touched for operator in operators)]
+            coupled = [
+                np.empty(0, dtype=np.int32),
+                *(operator.coupled_dofs for operator in operators),
+            ]
             self._rows = _global_rows(matrix, np.unique(np.concatenate(coupled)))
         block = matrix.createSubMatrix(self._rows, self._rows)
         if pc.getType() == PETSc.PC.Type.GAMG and self._block and present == self._stiffness:

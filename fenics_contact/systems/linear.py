@@ -33,13 +33,13 @@ __all__ = [
     "describe_memory_excess",
     "factor_bytes",
     "find_available_memory",
-    "forget_failure",
     "is_multigrid_faster",
+    "is_out_of_memory",
     "near_nullspace",
     "newton_options",
     "options",
     "quasi_newton_options",
-    "refused_memory",
+    "reset_failed_factorisation",
     "warn_of_slow_blas",
 ]
 
@@ -150,7 +150,7 @@ def describe_memory_excess(n_bytes: float, comm: MPI.Comm) -> str | None:
     )
 
 
-def refused_memory(pc: PETSc.PC) -> bool:
+def is_out_of_memory(pc: PETSc.PC) -> bool:
     """Return whether a factorisation ran out of memory."""
     if not pc.getFailedReason():
         return False
@@ -161,7 +161,7 @@ def refused_memory(pc: PETSc.PC) -> bool:
     return mumps and pc.getFactorMatrix().getMumpsInfog(1) in _MEMORY_ERRORS
 
 
-def forget_failure(pc: PETSc.PC) -> None:
+def reset_failed_factorisation(pc: PETSc.PC) -> None:
     """Reset a preconditioner whose factorisation failed. Collective.
 
     PETSc would otherwise apply MUMPS' failure to all later matrices and solve without factors.

@@ -44,7 +44,7 @@ def project_multiplier_updates(operator: ContactOperator, state: Array, constrai
     if not global_max(operator.unknowns.comm, fixed.astype(np.float64)):
         return
     values, force = contact.values, operator.unknowns.vector()
-    change = multipliers.tangential_change(values)
+    change = multipliers.tangential_update(values)
     tangential = np.eye(change.shape[1]) - np.einsum("qi,qj->qij", values.normal, values.normal)
     stiffness = operator.springs(tangential)
     operator.add_force(force, -values.tangential(change))
@@ -55,7 +55,7 @@ def project_multiplier_updates(operator: ContactOperator, state: Array, constrai
     stiffness.diagonalScale(free, free)
     solver = create_mass_solver(stiffness, rtol=ROUND_OFF, atol=1e-300, max_it=500)
     solver.solve(force, projection)
-    multipliers.leave_out(change - values.tangential(operator.jump(projection.array_r)))
+    multipliers.exclude(change - values.tangential(operator.jump(projection.array_r)))
     for item in (force, stiffness, free, projection, solver):
         item.destroy()
 
@@ -63,7 +63,7 @@ def project_multiplier_updates(operator: ContactOperator, state: Array, constrai
 def _find_fixed_dofs(operator: ContactOperator, state: Array, constrained: Mask) -> Mask:
     """Return the coupled unknowns that are fixed at the obstacle, a mask. Collective."""
     coupled = np.zeros(len(constrained), dtype=np.bool_)
-    coupled[operator.touched] = True
+    coupled[operator.coupled_dofs] = True
     shift = operator.unknowns.vector()
     operator.add_force(shift, np.abs(operator.contact.values.shift))
     fixed = coupled & constrained & (state == 0.0) & (shift.array_r == 0.0)

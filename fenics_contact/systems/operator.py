@@ -80,7 +80,10 @@ class ContactOperator:
         With finite kinematics all unknowns that pairs may couple are selected, except round-off of
         functions that are zero on facets.
         """
-        if not isinstance(self.unknowns, DofSubset) or self.contact.contact_kinematics.follows:
+        if (
+            not isinstance(self.unknowns, DofSubset)
+            or self.contact.contact_kinematics.pairs_follow_bodies
+        ):
             return None
         pointers, columns, values = self.contact.pairs.jump_map.getValuesCSR()
         row = np.repeat(np.arange(pointers.size - 1), np.diff(pointers))
@@ -108,7 +111,7 @@ class ContactOperator:
         return create_csr_matrix(self.unknowns.comm, self.unknowns.n_local, pointers, columns, ones)
 
     @cached_property
-    def touched(self) -> Indices:
+    def coupled_dofs(self) -> Indices:
         """This rank's unknowns that the contact couples, ascending. Collective."""
         return self.find_dofs(np.ones(self.contact.quadrature.n_points, dtype=np.bool_))
 
@@ -116,9 +119,9 @@ class ContactOperator:
     def possible_dofs(self) -> Indices:
         """This rank's unknowns that the contact may couple, now or later. Collective."""
         pairs, displacement = self.contact.pairs, self.contact.displacement
-        if not self.contact.contact_kinematics.follows:
-            return self.touched
-        reach = self.unknowns.widen(displacement.expand_columns(pairs.reach))
+        if not self.contact.contact_kinematics.pairs_follow_bodies:
+            return self.coupled_dofs
+        reach = self.unknowns.widen(displacement.expand_columns(pairs.coupling_map))
         return self._coupled(reach, np.ones(reach.getLocalSize()[0]))
 
     def find_dofs(self, chosen: Mask) -> Indices:
@@ -189,7 +192,7 @@ class ContactOperator:
             A new matrix over the unknowns (force/length).
         """
         blocks = self.contact.area[:, None, None] * stiffness
-        follows = self.contact.contact_kinematics.follows  # then D changes each time
+        follows = self.contact.contact_kinematics.pairs_follow_bodies  # then D changes each time
         if isinstance(self.unknowns, DofSubset) and self._angle is None and not follows:
             return self._product(blocks)
         if self._angle is None:
@@ -281,7 +284,9 @@ class ContactOperator:
         if self.unknowns.has_motions_here:
             forces.array[column - self.unknowns.first] = -diagonal / 2
         n = self.unknowns.n_local
-        column_part = self._column_matrix(n, column, self.touched, forces.array_r[self.touched])
+        column_part = self._column_matrix(
+            n, column, self.coupled_dofs, forces.array_r[self.coupled_dofs]
+        )
         row_part = column_part.copy().transpose()
         for part in (column_part, row_part):
             product.axpy(-1.0, part, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)

@@ -138,7 +138,7 @@ class ReferenceScales:
 
     def begin(self, operators: Sequence[ContactOperator]) -> None:
         """Find the groups of coupled parts at the start of an increment. Collective."""
-        if self._pairings == (pairings := [o.contact.pairs.number for o in operators]):
+        if self._pairings == (pairings := [o.contact.pairs.n_updates for o in operators]):
             return
         self._pairings, n = pairings, len(self.group)
         self.contact_bodies = np.zeros((len(operators), self.n_bodies), dtype=np.bool_)
@@ -189,7 +189,7 @@ class ReferenceScales:
         """Return the group of each of this rank's points of a contact, (n_points,)."""
         return np.asarray(self.group[self._slave_bodies[number]])
 
-    def parts_of(self, number: int) -> dict[int, Mask]:
+    def points_by_group(self, number: int) -> dict[int, Mask]:
         """Return masks of this rank's points of a contact, (n_points,), by group. Collective.
 
         All ranks have the same groups in the same order.

@@ -98,7 +98,7 @@ class RigidBodyModes(RigidMotions):
             moves.any(axis=1) & ~moves[:, ~bodies].any(axis=1) & ~obstacles.any(axis=1)
         )
 
-    def in_free(self, modes: Array) -> Array:
+    def project_on_free(self, modes: Array) -> Array:
         """Return a basis of the modes that are still free, (n_modes, n_free). Collective."""
         if not (len(modes) and len(self.free)):
             return np.zeros((0, len(self.free)))
@@ -108,7 +108,7 @@ class RigidBodyModes(RigidMotions):
         rank = np.count_nonzero(sizes > NEGLIGIBLE * sizes.max(initial=0.0))
         return broadcast_from_root(self.comm, np.asarray(basis[:rank], dtype=np.float64))
 
-    def move_any(self, modes: Array, bodies: Mask) -> Mask:
+    def find_modes_moving(self, modes: Array, bodies: Mask) -> Mask:
         """Return which modes, (n_modes, n_free), move any of the bodies, a mask (n_modes,)."""
         moves, _ = self._moved_parts()
         return np.asarray((modes != 0.0) @ moves[:, bodies].any(axis=1))
@@ -162,9 +162,9 @@ class RigidBodyModes(RigidMotions):
 
         Closed points are active, and tangentially also open points with a given friction bound.
         """
-        return not (len(self.free) and self.unconstrained(operators, closed_only=True).size)
+        return not (len(self.free) and self.find_unconstrained(operators, closed_only=True).size)
 
-    def unconstrained(
+    def find_unconstrained(
         self,
         operators: Sequence[ContactOperator],
         *,
@@ -273,12 +273,12 @@ class RigidBodyModes(RigidMotions):
             basis.append(vectors)
         return broadcast_from_root(self.comm, np.concatenate(basis))
 
-    def straight(self) -> Index:
+    def find_state_independent_modes(self) -> Index:
         """Return the numbers of the free motions except rotations of obstacles."""
         return np.flatnonzero(~np.any(self.free[:, self.is_obstacle_rotation] != 0.0, axis=1))
 
     @property
-    def turning(self) -> bool:
+    def has_obstacle_rotations(self) -> bool:
         """Whether some free motions are rotations of obstacles, whose arms depend on the state."""
         return bool(self.is_obstacle_rotation.any())
 
@@ -301,7 +301,7 @@ class RigidBodyModes(RigidMotions):
             The generalised load, 0 where it is round-off, and its bound if all forces acted along
             the mode: (n_straight,) (force) each.
         """
-        rows = self.straight()
+        rows = self.find_state_independent_modes()
         bounds = self._sum_products(np.abs(load), np.abs(self.of_bodies))
         sums = np.stack([self.free @ self._sum_products(load), np.abs(self.free) @ bounds])[:, rows]
         for operator in operators:
@@ -323,7 +323,9 @@ class RigidBodyModes(RigidMotions):
         """Return the largest size of `load_resultant` by group, (n_groups,) (force). Collective."""
         largest: Array = np.zeros(self._scales.n_groups)
         resultants = self.load_resultant(load, ())[0]
-        np.maximum.at(largest, self.groups()[self.straight()], np.abs(resultants))
+        np.maximum.at(
+            largest, self.groups()[self.find_state_independent_modes()], np.abs(resultants)
+        )
         return largest
 
 

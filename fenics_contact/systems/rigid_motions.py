@@ -101,7 +101,7 @@ class RigidMotions:
         The motions are by default those of the undeformed bodies.
         """
         motions, n = self.of_bodies if of_bodies is None else of_bodies, self._n_bodies
-        products = [system.part(motion) * values for motion in motions]
+        products = [system.restrict(motion) * values for motion in motions]
         sums = [np.bincount(system.label, p, minlength=n)[:n] for p in products]
         return np.stack(sums, axis=1).astype(
             np.float64

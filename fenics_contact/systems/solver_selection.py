@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fenics_contact.systems import linear
-from fenics_contact.systems.candidate_dofs import touched
+from fenics_contact.systems.candidate_dofs import find_coupled_dofs
 from fenics_contact.systems.condensed import is_worthwhile, should_retain_all
 from fenics_contact.systems.full import FullSystem
 
@@ -72,7 +72,7 @@ def reason_not_to_condense(
 
 def _count_coupled(full: FullSystem) -> int:
     """Count the unknowns that contact couples, or may couple with other pairs. Collective."""
-    return int(full.unknowns.comm.allreduce(touched(full.operators, full.unknowns).size))
+    return int(full.unknowns.comm.allreduce(find_coupled_dofs(full.operators, full.unknowns).size))
 
 
 def linear_kind(

@@ -66,7 +66,7 @@ class Substructure:
             _call_petsc("MatFactorSetSchurIS", _handle(self._factor), _handle(chosen))
         self._pc.setUp()
         error = self._factor.getMumpsInfog(1)
-        if linear.refused_memory(self._pc):
+        if linear.is_out_of_memory(self._pc):
             raise MemoryError(
                 "out of memory in the factorisation for static condensation (MUMPS error "
                 f"{error}): use condensation=False, or more ranks"

@@ -44,7 +44,8 @@ class System(ABC):
         constrained: Mask of this rank's unknowns with Dirichlet conditions.
         prescribed: Values at them, in the present increment.
         load: External forces at the unknowns (force).
-        outside: Norms of load and `terms` at unknowns outside of the system, (2, n_bodies).
+        outside: Norms of load and round-off magnitude at unknowns outside of the system, (2,
+            n_bodies).
         label: Body or free obstacle of every unknown of this rank, (n_local,).
         n_bodies: Number of bodies and free obstacles.
         scales: Reference scales of the bodies.
@@ -109,10 +110,10 @@ class System(ABC):
         and only if, the pairs of its contact have changed.
         """
         for contact in self.contacts:
-            if contact.contact_kinematics.follows:
+            if contact.contact_kinematics.pairs_follow_bodies:
                 contact.contact_kinematics.update()
         for i, contact in enumerate(self.contacts):
-            number = contact.pairs.number
+            number = contact.pairs.n_updates
             if i not in self._operators or self._operators[i][0] != number:
                 operator = ContactOperator(contact, self.unknowns, self._first_motions[i])
                 self._operators[i] = number, operator
@@ -121,13 +122,13 @@ class System(ABC):
     @property
     def parts(self) -> Parts:
         """The partition into bodies, obstacles and contacts, for the present pairs. Collective."""
-        pairings = [c.pairs.number for c in self.contacts]
+        pairings = [c.pairs.n_updates for c in self.contacts]
         if self._parts is None or self._parts[0] != pairings:
             moving = [(n, m.way) for n, c in enumerate(self.contacts) for m in c.motions]
             n = self.n_bodies - len(moving)
             bodies = [f"body {b + 1}" if n > 1 else "the body" for b in range(n)]
             bodies += [f"obstacle of {self.contacts[c].name} {way}" for c, way in moving]
-            coupled = [operator.touched for operator in self.operators]
+            coupled = [operator.coupled_dofs for operator in self.operators]
             scales = self.scales
             parts = Parts(
                 self.unknowns.comm,
@@ -176,7 +177,7 @@ class System(ABC):
             total,
             contacts,
             self.load,
-            self.terms(self.state()),
+            self.roundoff_magnitude(self.state()),
             self.constrained,
             self.outside,
             start,
@@ -218,7 +219,7 @@ class System(ABC):
         """Create a vector over the unknowns. Collective."""
         return self.unknowns.vector()
 
-    def terms(self, state: Array) -> Array:
+    def roundoff_magnitude(self, state: Array) -> Array:
         """Return the magnitude of the terms of K u, which bounds its round-off (force). Collective.
 
         Finite kinematics sum up coordinates, and contact of two bodies the displacements of both.
@@ -226,20 +227,20 @@ class System(ABC):
         size = np.abs(state)
         for operator in self.operators:
             if not operator.contact.rigid:
-                coupled = operator.touched
+                coupled = operator.coupled_dofs
                 size[coupled] = global_max(self.unknowns.comm, size[coupled])
         return np.asarray(self.diagonal * (size + self._largest_coordinates()))
 
     def _largest_coordinates(self) -> Array:
         """Return the largest coordinate at dofs of finite contacts, 0 elsewhere. Collective."""
-        pairings = [c.pairs.number for c in self.contacts]
+        pairings = [c.pairs.n_updates for c in self.contacts]
         if self._coordinate_bounds is None or self._coordinate_bounds[0] != pairings:
             bounds = np.zeros(self.unknowns.n_local)
             for operator in self.operators:
                 if operator.contact.finite:
                     points = np.abs(operator.contact.points)
-                    bounds[operator.touched] = global_max(self.unknowns.comm, points)
-            self._coordinate_bounds = [c.pairs.number for c in self.contacts], bounds
+                    bounds[operator.coupled_dofs] = global_max(self.unknowns.comm, points)
+            self._coordinate_bounds = [c.pairs.n_updates for c in self.contacts], bounds
         return self._coordinate_bounds[1]
 
     def by_body(self, *vectors: Array) -> Array:
@@ -269,7 +270,7 @@ class System(ABC):
 
     def is_degenerate(self) -> bool:
         """Return whether Γc has lost its tangent plane at a point."""
-        return any(contact.pairs.degenerate for contact in self.contacts)
+        return any(contact.pairs.is_degenerate for contact in self.contacts)
 
     @abstractmethod
     def state(self) -> Array:
@@ -279,11 +280,11 @@ class System(ABC):
     def set_state(self, state: Array) -> None:
         """Set the present unknowns. Collective."""
 
-    def part(self, state: Array) -> Array:
+    def restrict(self, state: Array) -> Array:
         """Restrict a state of all unknowns to this system. Collective."""
         return state
 
-    def extended(self, change: Array) -> Array:
+    def extend(self, change: Array) -> Array:
         """Extend a change of the unknowns of this system to all. Collective."""
         return change
 
