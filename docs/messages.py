@@ -20,7 +20,7 @@ HOLE = "…"
 # More ways than this to fill a hole are left open.
 _MOST = 4
 # Functions whose strings are parts of a verdict, and of what is told of an attempt.
-_VERDICT = {"failures", "hidden_by_round_off", "limit_point", "round_off_in_words"}
+_VERDICT = {"hidden_by_round_off", "limit_point", "round_off_in_words"}
 _ATTEMPT = {"describe_chattering", "describe"}
 
 
@@ -147,7 +147,9 @@ class _Module:
     ) -> Iterator[tuple[str, ast.expr]]:
         """Kinds of messages, and the expressions of their texts, that begin at a node."""
         name = within.name if within is not None else ""
-        told = {**dict.fromkeys(_VERDICT, "verdict"), **dict.fromkeys(_ATTEMPT, "attempt")}
+        told = dict.fromkeys(_VERDICT, "verdict")
+        if self.name.startswith("methods."):
+            told |= dict.fromkeys(_ATTEMPT, "attempt")
         if isinstance(node, ast.AugAssign) and name in told:
             value = node.value
             if isinstance(value, ast.ListComp):
@@ -158,6 +160,9 @@ class _Module:
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             if any(isinstance(t, ast.Name) and t.id == "_OUTCOMES" for t in targets):
                 yield from (("attempt", value) for value in node.value.values)
+        if name == "conditions" and isinstance(node, ast.Assign):
+            if isinstance(node.value, ast.JoinedStr | ast.Constant):
+                yield "verdict", node.value
         if not isinstance(node, ast.Call) or not node.args:
             return
         function, first = node.func, node.args[0]
@@ -166,6 +171,8 @@ class _Module:
                 yield function.id, first
             elif function.id == "warn":
                 yield "warning", node.args[-1]
+            elif function.id == "Condition" and isinstance(node.args[-1], ast.JoinedStr):
+                yield "verdict", node.args[-1]
         elif isinstance(function, ast.Attribute):
             base = ast.unparse(function.value)
             if base == "warnings" and function.attr == "warn":
@@ -176,6 +183,8 @@ class _Module:
                 yield "log", first
             elif base == "super()" and function.attr == "__init__" and self._of_error(node):
                 yield self._of_error(node), first
+            elif function.attr == "condition":
+                yield "verdict", node.args[1]
             elif function.attr == "append" and name in told:
                 yield told[name], first
 

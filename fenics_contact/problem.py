@@ -587,14 +587,16 @@ class ContactProblem:
             points: History and values of every contact for `ContactStates.load_restart`.
         """
         state, change, internal, external, load_change, retained, _ = rows
-        increment, self.expected_increments, *anew = (int(number) for number in numbers)
+        increment, self.expected_increments, *updates_pairs = (int(number) for number in numbers)
         self._is_first, self._trial = False, None
         self.solver.retain_dofs(np.flatnonzero(retained).astype(np.int32))
         self.full.set_state(state)
         load = self.full.present_load()
         self.full.begin(load)
-        for contact, (history, values), again in zip(self.contacts, points, anew, strict=True):
-            contact.states.load_restart(history, values, anew=bool(again))
+        for contact, (history, values), again in zip(
+            self.contacts, points, updates_pairs, strict=True
+        ):
+            contact.states.load_restart(history, values, updates_pairs=bool(again))
         forces = Forces(state, internal, external, self.full.label)
         energy = EnergyState.at({self.full.coordinate_id: forces}, self.contacts)
         self.state = State(

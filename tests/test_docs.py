@@ -196,6 +196,19 @@ def test_every_error_is_told() -> None:
     assert len(told) > 200
 
 
+def test_every_condition_is_told() -> None:
+    """Each text with which a verdict fails, where it stands: at least one by condition."""
+    told = {m.module for m in messages.read() if m.kind == "verdict"}
+    texts = [m.text for m in messages.read() if m.kind == "verdict" and "checks" in m.module]
+    for path in (messages.PACKAGE / "checks").glob("*.py"):
+        if "Condition(" in path.read_text() and path.stem != "condition":
+            assert f"checks.{path.stem}" in told
+    for words in ("residual of", "is ejected", "cells are inverted", "friction supplies energy"):
+        assert any(words in text for text in texts), words
+    for words in ("has crossed the obstacle", "small-displacement assumption", "a distance"):
+        assert any(words in text for text in texts), words
+
+
 def test_every_warning_is_told() -> None:
     """By name of the call, as it stands in the sources."""
     told = Counter(m.module for m in messages.read() if m.kind == "warning")

@@ -260,8 +260,9 @@ class Verdict:
                 "(increments() halves them where needed), start with the bodies in contact, or "
                 "constrain it by a weak spring"
             )
-            condition = f"displacement without force, {name}"
-            conditions.append(Condition(condition, displacement, limit, failure))
+            conditions.append(
+                Condition(f"displacement without force, {name}", displacement, limit, failure)
+            )
         failure = (
             "cells are inverted, det(I + grad u) ≤ 0. Use smaller increments (increments() halves "
             "them where needed), or refine the mesh there"

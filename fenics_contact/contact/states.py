@@ -214,13 +214,15 @@ class ContactStates:
         self._kinematics.set_state((trial or self.committed).kinematics)
         self._values = (trial or self.committed).points
 
-    def load_restart(self, history: Array, values: Mapping[str, Array], *, anew: bool) -> None:
+    def load_restart(
+        self, history: Array, values: Mapping[str, Array], *, updates_pairs: bool
+    ) -> None:
         """Commit a state of another run, whose ``u`` and loads are set. Collective.
 
         Args:
             history: `PointFields.rows` of that run.
             values: The arrays of its `values`, which become the results.
-            anew: Whether that run updates pairs at every commit.
+            updates_pairs: Whether that run updates pairs at every commit.
         """
         commits = self.committed.commits + 1
         self.set_state(ContactState(history, self._kinematics.state()))
@@ -230,7 +232,7 @@ class ContactStates:
             return self.values
 
         unknown = np.zeros(len(self.history.rows()))
-        self._kinematics.resume(values.get("depth", unknown), evaluate_now, new_pairs=anew)
+        self._kinematics.resume(values.get("depth", unknown), evaluate_now, new_pairs=updates_pairs)
         points = self.values
         shapes = {n: v.shape for n, v in points.arrays.items()}
         if {n: v.shape for n, v in values.items()} == shapes:

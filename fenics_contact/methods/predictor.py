@@ -142,7 +142,7 @@ class Predictor:
                 is_reversed = self._has_friction_work()
             if step is None or is_reversed or not residuals[step] < residuals[0]:
                 step = None
-                add(self._step_by_prescribed_change(present, anew=True))
+                add(self._step_by_prescribed_change(present, reassemble=True))
         else:
             tractions = self._predict_tractions() if factored and first_augmentation else None
             if tractions is not None or (predicts and equations.full.bulk.linear):
@@ -187,7 +187,7 @@ class Predictor:
             work += float(contact.measure @ power)
         return bool(self._equations.full.unknowns.comm.allreduce(work) > 0.0)
 
-    def _step_by_prescribed_change(self, present: Array, *, anew: bool = False) -> Array:
+    def _step_by_prescribed_change(self, present: Array, *, reassemble: bool = False) -> Array:
         """Predict the effect of changed prescribed values by one linear step. Collective.
 
         Otherwise they might invert cells of a nonlinear bulk next to the boundary, from which no
@@ -195,8 +195,8 @@ class Predictor:
 
         Args:
             present: The state with the present prescribed values.
-            anew: Whether to assemble the tangent at the end of the last increment, with all closed
-                points sticking; by default the last factored one is used, with slipping points.
+            reassemble: Whether to assemble the tangent at the end of the last increment, with all
+                closed points sticking; by default the last factored one is used, with slipping points.
 
         Returns:
             The predicted state, or ``present`` if the step failed.
@@ -208,13 +208,13 @@ class Predictor:
         full.set_state(present - self._prescribed_change)
         full.update_stiffness()
         ksp = equations.solvers[True]
-        if anew:
+        if reassemble:
             full.evaluate()
             matrix = equations.matrix(True)
             equations.assemble(matrix, equations.regularised_tangents())
         assert full.stiffness is not None
         full.stiffness.mult(change, image)
-        tractions = None if anew else self._predict_tractions()
+        tractions = None if reassemble else self._predict_tractions()
         if tractions is not None:
             for operator, converged, traction in zip(
                 full.operators, self._converged, tractions, strict=True
@@ -230,7 +230,9 @@ class Predictor:
         if not solved:
             return present
         increment: Array = step.array.copy()
-        return present + (increment if anew else self._replace_modes(full, present, increment))
+        return present + (
+            increment if reassemble else self._replace_modes(full, present, increment)
+        )
 
     def _step_by_tangent(self, present: Array, tractions: list[Array] | None) -> Array | None:
         """Compute one Newton step with the last factored tangent. Collective.

@@ -19,7 +19,7 @@ __all__ = ["SumOperator", "UpdatedLU", "raise_stored_error"]
 
 # Largest ratio of changed unknowns to all up to which the factors are updated.
 _MAX_UPDATE_RATIO = 0.25
-# Relative residual of an updated solution above which all is factored anew.
+# Relative residual of an updated solution above which all is factored again.
 _UPDATE_RTOL = 1e-11
 
 
@@ -105,7 +105,7 @@ class UpdatedLU:
                 del error  # breaks the cycle of traceback and frame
 
     def setUp(self, pc: PETSc.PC) -> None:
-        """Update the factors, or factor anew."""
+        """Update the factors, or factor again."""
         reasons = PETSc.PC.FailedReason
         self._operator = pc.getOperators()[1].getPythonContext()
         try:
@@ -170,7 +170,7 @@ class UpdatedLU:
             y.set(np.nan)
 
     def _solve(self, right: Array) -> Array:
-        """Solve, and factor anew if the residual of an updated solution is too large."""
+        """Solve, and factor again if the residual of an updated solution is too large."""
         solution = scipy.linalg.lu_solve(self._factor, right, check_finite=False)
         if not self._changed_dofs.size:
             return solution

@@ -43,7 +43,7 @@ class Hierarchy:
         Args:
             ksp: The solver.
             matrix: Bulk stiffness plus contact, the same object as in the last call.
-            stiffness: Bulk stiffness; if it has changed, all levels are set up anew.
+            stiffness: Bulk stiffness; if it has changed, all levels are set up again.
             operators: Contact operators, which couple the same unknowns as in the last call.
         """
         pc, present = ksp.getPC(), (stiffness.handle, stiffness.stateGet())

@@ -377,7 +377,7 @@ def tangential_gram(contact: Contact, modes: Array, *, closed_only: bool) -> Arr
     Args:
         contact: An evaluated contact.
         modes: Jumps of the modes, (n, n_points, gdim).
-        closed_only: As in `RigidBodyModes.unconstrained`.
+        closed_only: As in `RigidBodyModes.find_unconstrained`.
     """
     if not contact.law.has_tangential:
         return np.zeros((len(modes), len(modes)))
