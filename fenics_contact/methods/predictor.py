@@ -198,6 +198,9 @@ class Predictor:
             reassemble: Whether to assemble the tangent at the end of the last increment, with all
                 closed points sticking; by default the last factored one is used, with slipping
                 points.
+
+        Returns:
+            The predicted state, or ``present`` if the step failed.
         """
         equations, full = self._equations, self._equations.full
         change, image, step = full.vector(), full.vector(), full.vector()
