@@ -113,7 +113,7 @@ def test_the_residual_is_the_gradient_of_the_energy(cell, condensation):
     f, y, z = x.duplicate(), x.duplicate(), x.duplicate()
     direction = fem.Function(scene.u.function_space)
     direction.interpolate(wave(scene.dim, 3))
-    y.array[:] = np.where(space.constrained, 0.0, space.part(owned(direction)))
+    y.array[:] = np.where(space.constrained, 0.0, space.restrict(owned(direction)))
     x.axpy(0.02, y)  # away from the solution, where slopes are not zero
     equations.residual(x, f)
     slope, step = f.dot(y), 1e-5

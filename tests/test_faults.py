@@ -274,7 +274,7 @@ made.problem.solve()
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="starts ranks of its own")
-@pytest.mark.parametrize("name", ["residual_at", "solved"])
+@pytest.mark.parametrize("name", ["residual_at", "is_converged"])
 def test_one_rank_fails_alone(name):
     """Where nothing tells the other ranks, which wait: all are ended, with the error shown."""
     words = command(2, "-c", ALONE.format(name=name))

@@ -402,7 +402,7 @@ def test_a_traction_that_is_not_rotated_is_detected():
 
     def modify(setup, problem):
         present = problem.contacts[0].pairs
-        present.turned = lambda vectors, back=False: vectors
+        present.rotate = lambda vectors, inverse=False: vectors
 
     outcome = solve(TWO, modify=modify)
     assert outcome.outcome == "wrong"

@@ -235,7 +235,7 @@ def test_an_obstacle_that_goes_through_in_one_increment_is_refused():
     contact.evaluate()
     probe = RigidObstacleProbe(contact)
     gone, x = (
-        gathered(COMM, each)[:, 0] for each in (probe.crossed(np.zeros(len(probe.x))), probe.x)
+        gathered(COMM, each)[:, 0] for each in (probe.find_crossed(np.zeros(len(probe.x))), probe.x)
     )
     # It has passed straight down over all halves of facets below its middle half, and over none
     # aside of it.

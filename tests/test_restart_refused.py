@@ -135,7 +135,7 @@ def test_nodes_elsewhere_are_another_mesh(saved):
     x = made.scene.mesh.geometry.x
     x[np.all(np.abs(x[:, :2] - 0.5) < 1e-9, axis=1), 0] += 1e-6
     call = lambda: next(made.increments(checkpoint=saved, on_mismatch="continue"))  # noqa: E731
-    raised_everywhere(call, ValueError, "nodes", "places")
+    raised_everywhere(call, ValueError, "nodes", "locations")
 
 
 def test_data_that_the_load_changes_are_no_change(tmp_path):

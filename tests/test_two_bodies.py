@@ -437,7 +437,7 @@ def test_facets_over_which_the_opposite_ends_are_warned_of(cell, n, width) -> No
             for _ in range(2):
                 problem.solve()
                 problem.commit()
-        told.append(sum("opposite surface ends" in str(w.message) for w in caught))
+        told.append(sum("opposing surface ends" in str(w.message) for w in caught))
         forces.append(contact.resultants().normal_force)
     assert told == [1, 0, 0]
     assert forces[0] < 0.93 * forces[2]
