@@ -180,7 +180,7 @@ def test_forces_that_are_round_off_supply_no_energy(kinematics, E):
 
 @pytest.mark.parametrize("options", WAYS, ids=["condensed", "lbfgs", "newton"])
 def test_a_load_is_removed_after_a_restart(options):
-    """A block above the floor, its top moved and moved back: at rest, to 1e-15 of the motion.
+    """A block above the floor, its top moved and moved back: at rest, to 40 eps of the motion.
 
     Nothing resists, so that all forces at the end are round-off of those at the start: 40 eps of
     them. After a restart this was taken as none, and every iteration was asked for 1e-9 of what
@@ -200,4 +200,5 @@ def test_a_load_is_removed_after_a_restart(options):
     problem.restart_solver()
     top.value = 0.0
     assert problem.solve().iterations <= 2
-    assert COMM.allreduce(np.abs(problem.u.x.array).max(initial=0.0), op=MPI.MAX) <= 1e-16
+    left = COMM.allreduce(np.abs(problem.u.x.array).max(initial=0.0), op=MPI.MAX)
+    assert left <= 40 * np.finfo(float).eps * 0.1
