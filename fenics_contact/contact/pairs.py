@@ -114,8 +114,8 @@ class Pairs:
     def _warn_of_unpaired(self, reasons: Index) -> None:
         """Warn if more than half of the points have no opposite point, with reasons. Collective."""
         comm, n = self._mesh.comm, self._quadrature.n_points
-        counts = [np.count_nonzero(~self.paired & (reasons == reason)) for reason in REASONS]
-        *counts, total = (int(number) for number in global_sum(comm, [*counts, n]))
+        local = [np.count_nonzero(~self.paired & (reasons == reason)) for reason in REASONS]
+        *counts, total = (int(number) for number in global_sum(comm, [*local, n]))
         if 2 * self.n_unpaired > total:
             text = [f"{k}: {why}" for k, why in zip(counts, REASONS.values(), strict=True) if k]
             warn(
