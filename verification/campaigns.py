@@ -25,6 +25,7 @@ CAMPAIGNS = {
     "the same, 3 ranks": ("campaign.csv", "3"),
     "unrelated bodies, thin obstacles, long paths": ("campaign_mixed.csv", "1"),
     "the same, later": ("campaign_mixed_later.csv", "1"),
+    "the same, latest": ("campaign_mixed_latest.csv", "1"),
     "finite kinematics, rigid obstacles": ("campaign_finite.csv", "1"),
     "finite kinematics, two bodies": ("campaign_bodies.csv", "1"),
     "the same, dissimilar bodies": ("campaign_unlike.csv", "1"),
@@ -66,7 +67,7 @@ def page(found: dict[str, list[Row]]) -> str:
     increments = sum(int(row["increments"] or 0) for rows in found.values() for row in rows)
     lines = ["# Random scenes", ""]
     lines += report.text(
-        f"**{wrong} of {total} random scenes had a wrong result when they were run**, of which 3 "
+        f"**{wrong} of {total} random scenes had a wrong result when they were run**, of which 4 "
         "are not explained ([below](#wrong-results)). Every scene is solved by the package and by "
         f"an independent solver, {increments:,} increments in all; 1748 scenes that were run "
         "before are not in the table."
@@ -138,6 +139,14 @@ def page(found: dict[str, list[Row]]) -> str:
         "facets passed through the obstacle between the points of vertex quadrature (814618): both "
         "are refused now. In one a point is 1e-9 of the length away from the vertex of a polygon, "
         "whose normal there has a round-off of 5e-8 (815370).",
+        f"- Of the {len(found['the same, latest'])} latest mixed scenes three were wrong. A body "
+        "that comes back from aside of its obstacle was counted as touching it too late (817254); "
+        "it is correct now. The independent solver allowed a slanted rod no more depth at the "
+        "corner of a coarse body than a flat one (817479); its limit has the slope now. A "
+        "multiplier differs by 3 % more than the tolerance (818660), which is not explained. Of "
+        "the methods without a limit on iterations two failed where round-off is no reason: the "
+        "round-off of a load removed after a restart was taken as none (818207), which is correct "
+        "now, and the other is not explained (818871).",
         "- Not explained, besides the first, are a penetration with multipliers 10 % above the "
         "tolerance, on a single facet (815746), and a slip reference 1e-4 of the body's size "
         "inside the obstacle, a plate that slides past the body (815922).",
