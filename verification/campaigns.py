@@ -144,9 +144,10 @@ def page(found: dict[str, list[Row]]) -> str:
         "it is correct now. The independent solver allowed a slanted rod no more depth at the "
         "corner of a coarse body than a flat one (817479); its limit has the slope now. A "
         "multiplier differs by 3 % more than the tolerance (818660), which is not explained. Of "
-        "the methods without a limit on iterations two failed where round-off is no reason: the "
+        "the methods without a limit on iterations two failed without naming round-off: the "
         "round-off of a load removed after a restart was taken as none (818207), which is correct "
-        "now, and the other is not explained (818871).",
+        "now, and a body strained by 3e-6 that is displaced by 29 lengths, which is solved without "
+        "that displacement (818871).",
         "- Not explained, besides the first, are a penetration with multipliers 10 % above the "
         "tolerance, on a single facet (815746), and a slip reference 1e-4 of the body's size "
         "inside the obstacle, a plate that slides past the body (815922).",
