@@ -150,10 +150,6 @@ class _Module:
         told = dict.fromkeys(_VERDICT, "verdict")
         if self.name.startswith("methods."):
             told |= dict.fromkeys(_ATTEMPT, "attempt")
-        if isinstance(node, ast.AugAssign) and name in told:
-            value = node.value
-            if isinstance(value, ast.ListComp):
-                yield told[name], value.elt
         if isinstance(node, ast.Return) and isinstance(node.value, ast.JoinedStr) and name in told:
             yield told[name], node.value
         if isinstance(node, ast.Assign | ast.AnnAssign) and isinstance(node.value, ast.Dict):

@@ -4,7 +4,7 @@ import numpy as np
 
 from fenics_contact.types import Array, Index
 
-__all__ = ["FLAT", "NEGLIGIBLE", "ROUND_OFF", "sort_by_coordinates"]
+__all__ = ["FLAT", "NEGLIGIBLE", "ROUND_OFF", "UNLOADED_FORCE_RATIO", "sort_by_coordinates"]
 
 # Sums and differences of forces, stiffness, work or weights, relative to the largest term.
 ROUND_OFF = 1e-12
@@ -13,6 +13,9 @@ NEGLIGIBLE = 1e-9
 # Unit vectors and extents of facets, which some mesh files store in single precision: right angles,
 # parallel and plane facets, the boundary of a facet.
 FLAT = 1e-6
+# Contact force on a rigid-body mode, relative to the load on it, below which the mode counts as
+# unloaded.
+UNLOADED_FORCE_RATIO = 1e-3
 
 
 def sort_by_coordinates(x: Array) -> Index:

@@ -182,9 +182,9 @@ def test_forces_that_are_round_off_supply_no_energy(kinematics, E):
 def test_a_load_is_removed_after_a_restart(options):
     """A block above the floor, its top moved and moved back: at rest, to 40 eps of the motion.
 
-    Nothing resists, so that all forces at the end are round-off of those at the start: 40 eps of
-    them. After a restart this was taken as none, and every iteration was asked for 1e-9 of what
-    the last one had left.
+    The exact solution is zero, so that all forces at the end are round-off of the forces at the
+    start, 40 eps of these. If the round-off is estimated as zero after a restart, the tolerance is
+    1e-9 of the remaining forces and shrinks with them.
     """
     box = Box((0.0, 0.5), n=(4, 4), bend=lambda x: x + 0.05 * np.sin(7 * x[:, ::-1]))
     scene = Beside({"block": box})

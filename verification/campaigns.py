@@ -139,15 +139,15 @@ def page(found: dict[str, list[Row]]) -> str:
         "facets passed through the obstacle between the points of vertex quadrature (814618): both "
         "are refused now. In one a point is 1e-9 of the length away from the vertex of a polygon, "
         "whose normal there has a round-off of 5e-8 (815370).",
-        f"- Of the {len(found['the same, latest'])} latest mixed scenes three were wrong. A body "
-        "that comes back from aside of its obstacle was counted as touching it too late (817254); "
-        "it is correct now. The independent solver allowed a slanted rod no more depth at the "
-        "corner of a coarse body than a flat one (817479); its limit has the slope now. A "
-        "multiplier differs by 3 % more than the tolerance (818660), which is not explained. Of "
-        "the methods without a limit on iterations two failed without naming round-off: the "
-        "round-off of a load removed after a restart was taken as none (818207), which is correct "
-        "now, and a body strained by 3e-6 that is displaced by 29 lengths, which is solved without "
-        "that displacement (818871).",
+        f"- Of the {len(found['the same, latest'])} latest mixed scenes three were wrong. For a "
+        "body that slides back onto its obstacle from beyond its end the first contact in the "
+        "increment was detected too late (817254); it is correct now. The independent solver "
+        "allowed a slanted rod no more depth at the corner of a coarse body than a flat one "
+        "(817479); its limit has the slope now. A multiplier differs by 3 % more than the "
+        "tolerance (818660), which is not explained. Of the methods without a limit on iterations "
+        "two failed without naming round-off: a removed load whose round-off was estimated as "
+        "zero after a restart (818207), which is correct now, and a body strained by 3e-6 that is "
+        "displaced by 29 lengths, which is solved without that displacement (818871).",
         "- Not explained, besides the first, are a penetration with multipliers 10 % above the "
         "tolerance, on a single facet (815746), and a slip reference 1e-4 of the body's size "
         "inside the obstacle, a plate that slides past the body (815922).",

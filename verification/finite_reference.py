@@ -649,7 +649,7 @@ def make_loads(setup: Any) -> Callable[[int, float], FiniteLoad]:
 # ---- the judge -----------------------------------------------------------------------------------
 
 
-class FiniteJudge(fuzz_judge.Verifier):
+class FiniteJudge(fuzz_judge.Judge):
     """Compares the package's increments with finite kinematics.
 
     Energies are not compared. With friction, rubber or curved obstacles an increment may have

@@ -174,7 +174,7 @@ def run_scene(
 
     from verification import fuzz_judge, fuzz_setup
 
-    setup_class, judge_class = fuzz_setup.SceneSetup, fuzz_judge.Verifier
+    setup_class, judge_class = fuzz_setup.SceneSetup, fuzz_judge.Judge
     if scene.get("kinematics") == "finite":
         from verification import finite_reference, finite_scenes
 

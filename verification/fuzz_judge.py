@@ -17,7 +17,7 @@ import scipy.spatial.distance
 from verification import fuzz_reference, fuzz_scenes
 from verification import reference_solver as reference
 
-__all__ = ["MAX_PENETRATION", "Verifier", "sample_surface"]
+__all__ = ["MAX_PENETRATION", "Judge", "sample_surface"]
 
 Array = np.ndarray
 
@@ -70,7 +70,7 @@ def sample_surface(surface: Any, u: Array, n: int = 9) -> tuple[Array, Array, Ar
     return surface.position(facet, xi, u)[0], surface.position(facet, xi)[0], facet
 
 
-class Verifier:
+class Judge:
     """Compares the package's increments, one by one.
 
     Attributes:

@@ -22,7 +22,7 @@ from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.hierarchy import Hierarchy
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.system import System
-from fenics_contact.tolerances import ROUND_OFF
+from fenics_contact.tolerances import ROUND_OFF, UNLOADED_FORCE_RATIO
 from fenics_contact.types import Array
 
 __all__ = ["Equations"]
@@ -30,8 +30,6 @@ __all__ = ["Equations"]
 
 # Stiffness of open points in H₀ by that of closed ones: constrains a body whose contact is open.
 _OPEN_STIFFNESS_RATIO = 1e-3
-# Contact force on a mode by the load, below which the mode counts as unloaded.
-_UNLOADED_FORCE_RATIO = 1e-3
 # Least regularisation of a mode, which may have no unbalanced force.
 _MIN_REGULARISATION_RATIO = 1e-6
 
@@ -287,7 +285,7 @@ class Equations:
         if not len(motions.free):
             return None
         # Round-off closes some of many points of an initially positioned body.
-        unloaded = full.contact_force_sizes() < _UNLOADED_FORCE_RATIO * self.generalised_loads
+        unloaded = full.contact_force_sizes() < UNLOADED_FORCE_RATIO * self.generalised_loads
         initial = self.monitor.initial_tractions or [c.values.total_traction for c in self.contacts]
         return UnconstrainedModes.find(
             motions, full.scales, full.operators, full.load, initial, unloaded

@@ -22,13 +22,11 @@ from fenics_contact.parallel import (
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.least_motion import minimise_norm
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes, tangential_gram
-from fenics_contact.tolerances import FLAT, NEGLIGIBLE
+from fenics_contact.tolerances import FLAT, NEGLIGIBLE, UNLOADED_FORCE_RATIO
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["InitialPositioning"]
 
-# Contact force by the load on a free mode below which a body counts as unloaded.
-_UNLOADED_FORCE_RATIO = 1e-3
 # Least work of the load in the modes towards contact by that in all modes.
 _MIN_WORK_RATIO = 0.5
 # Largest tangential fraction of a mode on Γc with friction, for tilts of up to 0.2.
@@ -96,7 +94,7 @@ class InitialPositioning:
         finite = all(contact.finite for contact in full.contacts)
         groups, load_size = motions.groups(), motions.generalised_load(self.load)
         contact_force = full.contact_force_sizes(committed=finite)
-        unloaded = (contact_force < _UNLOADED_FORCE_RATIO * load_size)[groups] & (not first)
+        unloaded = (contact_force < UNLOADED_FORCE_RATIO * load_size)[groups] & (not first)
         untouched = self._find_untouched()
         if first:
             present = full.state()

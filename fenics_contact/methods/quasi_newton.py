@@ -18,7 +18,7 @@ __all__ = ["QuasiNewton"]
 _MAX_STALLS = 10
 _MAX_OVERLOAD_STALLS = 3  # with an overload of friction at the present pressures
 # Contact force by the initial residual below which the initial active set is not used for H₀.
-_UNLOADED_FORCE_RATIO = 1e-3
+_INACTIVE_FORCE_RATIO = 1e-3
 # Residual by the least one from which on the iteration has diverged and returns to the latter.
 _DIVERGED_RATIO = 1e3
 
@@ -66,7 +66,7 @@ class QuasiNewton(SnesMethod):
         solution = equations.solution
         norms = equations.residual(solution, equations.function)
         contact_force = norms.force[norms.n_bodies :].max(initial=0.0)
-        unloaded = contact_force < _UNLOADED_FORCE_RATIO * norms.total
+        unloaded = contact_force < _INACTIVE_FORCE_RATIO * norms.total
         # Multigrid is inexpensive to set up again, a factorisation is reused.
         if (
             equations.uses_v_cycle
