@@ -232,27 +232,44 @@ def test_chosen_where_it_is_quicker():
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_bodies_count_as_much_as_they_cost_to_factor(turned):
-    """Boxes a, b, c of n unknowns as cubes of n √(b c)/a, and of several the mean of n^(4/3).
+@pytest.mark.parametrize("degree", [1, 2])
+def test_bodies_count_as_much_as_they_cost_to_factor(turned, degree):
+    """Unknowns of the least cross-section w as cubes of w^(3/2), and of several bodies the mean w².
 
-    Wherever they are and however they are turned. The nodes of n cells along an edge are spread as
-    (1 + 2/n) says, which is why it is not exact.
+    A cross-section has the cells across a box times the nodes per cell of the lattice, exactly.
+    Wherever the bodies are and however they are turned.
     """
-    sides, cells = np.array([4.0, 2.0, 1.0]), np.array([24, 12, 6])
-    lines = [np.linspace(0, side, n + 1) for side, n in zip(sides, cells, strict=True)]
-    coarse = [np.linspace(0, 1, 7) + 10.0 * (axis == 0) for axis in range(3)]
-    spread = sides**2 * (1 + 2 / cells)
-    slender = np.sqrt(spread[0] / np.sqrt(spread[1] * spread[2]))
-    nodes, cubes = np.array([25 * 13 * 7, 7**3]), np.array([25 * 13 * 7 / slender, 7**3])
-    for number, axes in ((1, [lines]), (2, [lines, coarse])):
-        mesh, _ = boxes(axes, {})
+    cells = np.array([[24, 12, 6], [8, 6, 7]])
+    lines = [
+        [np.linspace(0, n / 6, n + 1) + 10.0 * (body and axis == 0) for axis, n in enumerate(sides)]
+        for body, sides in enumerate(cells)
+    ]
+    nodes = np.prod(degree * cells + 1, axis=1)
+    across = np.array([12 * 6, 6 * 7]) * nodes / np.prod(cells, axis=1) / degree
+    for number in (1, 2):
+        mesh, _ = boxes(lines[:number], {})
         if turned:
             turn = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
             mesh.geometry.x[:] = mesh.geometry.x @ turn.T + 1e4
-        space = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
-        found = linear.cube_size(space, connected_bodies(space)[1])
-        work = nodes[:number] @ cubes[:number] ** (4 / 3) / nodes[:number].sum()
+        space = fem.functionspace(mesh, ("Lagrange", degree, (3,)))
+        found = linear.cube_size(space, connected_bodies(space)[1], degree)
+        work = nodes[:number] @ across[:number] ** 2 / nodes[:number].sum()
         assert found == pytest.approx(3 * work ** (3 / 4), rel=1e-9)
+
+
+def test_small_cells_in_the_middle_count():
+    """Twice as many cells across at the centre as on average: twice the cross-section."""
+    even, fine = np.linspace(-1.0, 1.0, 13), np.linspace(-1.0, 1.0, 13)
+    fine = 0.5 * fine + 0.5 * fine**3  # half the size at the centre
+    sizes = []
+    for line in (even, fine):
+        mesh, _ = boxes([[2 * even, line, line]], {})
+        space = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
+        sizes.append(linear.cube_size(space, connected_bodies(space)[1], 1))
+    assert sizes[1] == pytest.approx(sizes[0], rel=1e-9)  # as many cells across
+    mesh, _ = boxes([[2 * fine, even, even]], {})
+    space = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
+    assert linear.cube_size(space, connected_bodies(space)[1], 1) == pytest.approx(sizes[0])
 
 
 def test_chosen_by_the_number_of_increments(monkeypatch):
@@ -260,7 +277,7 @@ def test_chosen_by_the_number_of_increments(monkeypatch):
     scene = block("hexahedron", n=2)
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
     monkeypatch.setattr(linear, "_MULTIGRID_SIZE", 0)
-    monkeypatch.setattr(linear, "_SIZE_PER_INCREMENT", problem.full.unknowns.n_global / 2.5)
+    monkeypatch.setattr(linear, "_SIZE_PER_INCREMENT", problem.full.size_to_factor / 2.5)
     assert problem.solver.condensed
     problem.expected_increments = 2
     assert not problem.solver.condensed and problem.full.linear_kind == "multigrid"
@@ -343,7 +360,7 @@ def test_monitors_outlive_the_choice_of_the_solver(monkeypatch):
     scene = block("hexahedron", n=2, up=-1.0)
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
     monkeypatch.setattr(linear, "_MULTIGRID_SIZE", 0)
-    monkeypatch.setattr(linear, "_SIZE_PER_INCREMENT", problem.full.unknowns.n_global / 2.5)
+    monkeypatch.setattr(linear, "_SIZE_PER_INCREMENT", problem.full.size_to_factor / 2.5)
     before, seen = problem.snes, []
 
     def watch(snes, iteration, norm, name, *, unit):

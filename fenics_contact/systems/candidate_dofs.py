@@ -77,7 +77,8 @@ def select_nearest_dofs(
         operators: Contact operators over all unknowns.
         unknowns: All unknowns.
         away: `distances` of every contact.
-        wanted: Largest number of unknowns on all ranks, exceeded only by those of active points.
+        wanted: Largest number of unknowns on all ranks, exceeded only by those of active points and
+            points without a gap.
         round_off: Round-off of the distances: points that tie with the last one are included
             (length).
     """
@@ -85,12 +86,12 @@ def select_nearest_dofs(
     all_dofs = find_coupled_dofs(operators, unknowns)
     n_coupled = int(comm.allreduce(all_dofs.size))
     order = np.sort(gather_rows(comm, np.concatenate(away)))
-    n_active = int(np.count_nonzero(order == -np.inf))
+    n_closed = int(np.count_nonzero(order <= round_off))
     n_paired = int(np.count_nonzero(order < np.inf))
     dofs, n_dofs = all_dofs, n_coupled
     n_points = n_paired
-    while n_dofs > wanted and n_points > n_active:
-        n_points = max(n_active, min(n_points * wanted // n_dofs, n_points - 1))
+    while n_dofs > wanted and n_points > n_closed:
+        n_points = max(n_closed, min(n_points * wanted // n_dofs, n_points - 1))
         cutoff = order[n_points - 1] + round_off if n_points else -np.inf
         dofs = find_coupled_dofs(operators, unknowns, [a <= cutoff for a in away])
         n_dofs = int(comm.allreduce(dofs.size))

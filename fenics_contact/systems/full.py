@@ -84,7 +84,8 @@ class FullSystem(System):
         """`linear.cube_size` of the bodies, in the plane the number of dofs. Collective."""
         if self.gdim != 3:
             return self.unknowns.first_motion
-        return linear.cube_size(self.displacement.u.function_space, self.body)
+        u, degree = self.displacement.u, self.displacement.degree
+        return linear.cube_size(u.function_space, self.body, degree)
 
     def update_stiffness(self) -> bool:
         """Assemble the bulk tangent if it may have changed; return whether it was. Collective."""

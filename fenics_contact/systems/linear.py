@@ -54,10 +54,13 @@ _LU_RATIO = 1.8
 # Largest estimated factor relative to the memory.
 _MAX_MEMORY_RATIO = 0.5
 # `cube_size` from which multigrid is faster in three dimensions; in two MUMPS always is.
-_MULTIGRID_SIZE = 30_000
-# The same per increment if one factorisation condenses for all: it costs two increments by
-# multigrid at 108,000 unknowns, and four at 200,000.
-_SIZE_PER_INCREMENT = 50_000
+_MULTIGRID_SIZE = 12_000
+# Thickness of the layer in which `cube_size` counts cells, by the standard deviation of the nodes.
+_LAYER_RATIO = 0.2
+# The same per increment if one factorisation condenses for all. Time of multigrid for an increment
+# by that of condensing a block under a ball: 1.4 for 41,000 unknowns of equal cells, 0.8 for
+# 108,000; 0.5 for 29,000 of gmsh cells graded 1:6, whose `cube_size` is 42,000.
+_SIZE_PER_INCREMENT = 40_000
 
 # MUMPS' errors INFOG(1) for insufficient workspace or memory.
 _MEMORY_ERRORS = (-5, -7, -8, -9, -11, -13, -14, -15, -17, -18, -19, -20)
@@ -189,9 +192,11 @@ def warn_of_slow_blas() -> None:
 def is_multigrid_faster(n: float, dimension: int, *, condensed_for: int = 0) -> bool:
     """Return whether multigrid is faster than factorisations, by measured cost.
 
-    Time of one Cholesky factorisation by MUMPS relative to a solution by conjugate gradients with
-    GAMG for bolted plates (`scenes/bolted_joint.py`, three bodies, quadratic): 0.30 at 33,000
-    unknowns, 0.41 at 55,000, 0.60 at 107,000 and 1.02 at 190,000, whose `cube_size` is 29,000.
+    L-BFGS assembles H₀ two or three times in an increment and applies it thirty times: there
+    multigrid gains before it does in a linear solve. Time of L-BFGS with multigrid relative to that
+    with MUMPS' Cholesky factors for a block under a ball, ten increments: 1.0 at a `cube_size` of
+    7,500 (graded) and 9,400 (equal cells), 0.75 and 0.9 at 18,000 and 20,000 (graded, linear and
+    quadratic).
 
     Args:
         n: Number of unknowns in the plane, their `cube_size` in space.
@@ -201,32 +206,47 @@ def is_multigrid_faster(n: float, dimension: int, *, condensed_for: int = 0) -> 
     return dimension == 3 and n > max(_MULTIGRID_SIZE, condensed_for * _SIZE_PER_INCREMENT)
 
 
-def cube_size(space: fem.FunctionSpace, body: npt.NDArray[np.intp]) -> float:
+def cube_size(space: fem.FunctionSpace, body: npt.NDArray[np.intp], degree: int) -> float:
     """Return the unknowns of a cube with as many operations per unknown to factor. Collective.
 
-    A factorisation takes n w² operations if a cross-section of a body has w unknowns, n^(2/3) in a
-    cube. A body longer than its mean width by s has the cross-sections of a cube of n / s unknowns;
-    for several bodies w² is averaged. The size is invariant under rotations.
+    A factorisation takes n w² operations if the least cross-section of a body has w unknowns,
+    n^(2/3) in a cube with equal cells. Long bodies have less, bodies with small cells near the
+    centre more. Cross-sections are counted by the cells around the centroid, along the coordinate
+    axes and the principal axes, whichever are less. For several bodies w² is averaged.
 
     Args:
-        space: Function space of the displacement; its nodes give s: 1 for a cube, a/√(b c) for a
-            box a, b, c with even cells.
+        space: Function space of the displacement.
         body: Body of each node, ghosts included.
+        degree: Polynomial degree of the displacement.
     """
-    comm, dofmap = space.mesh.comm, space.dofmap
-    n_owned, n = dofmap.index_map.size_local, dofmap.index_map.size_global
-    x, body = space.tabulate_dof_coordinates()[:n_owned], body[:n_owned]
+    mesh, dofmap = space.mesh, space.dofmap
+    comm, n_owned = mesh.comm, dofmap.index_map.size_local
+    x = space.tabulate_dof_coordinates()
     # Relative to the mean, against cancellation far from the origin.
-    x = x - global_sum(comm, x.sum(axis=0)) / n
-    n_bodies = 1 + int(global_max(comm, body.astype(np.float64)))
+    x = x - global_sum(comm, x[:n_owned].sum(axis=0)) / dofmap.index_map.size_global
+    n_bodies = 1 + int(global_max(comm, body[:n_owned].astype(np.float64)))
     moments = np.zeros((n_bodies, 4, 4))  # sums of the products of (1, x)
-    np.add.at(moments, body, np.einsum("pi,pj->pij", *[np.insert(x, 0, 1.0, axis=1)] * 2))
-    work = 0.0
-    for moment in broadcast_from_root(comm, global_sum(comm, moments)):
-        count, sum_x = moment[0, 0], moment[0, 1:]
-        inertia = np.linalg.eigvalsh(moment[1:, 1:] - np.outer(sum_x, sum_x) / count)
-        slenderness = np.sqrt(inertia[2] / np.sqrt(inertia[0] * inertia[1]))
-        work += count * (count / slenderness) ** (4 / 3)
+    np.add.at(
+        moments,
+        body[:n_owned],
+        np.einsum("pi,pj->pij", *[np.insert(x[:n_owned], 0, 1.0, axis=1)] * 2),
+    )
+    n_cells = mesh.topology.index_map(mesh.topology.dim).size_local
+    nodes = dofmap.list[:n_cells]
+    body_of_cell = body[nodes[:, 0]] if n_cells else np.zeros(0, dtype=np.intp)
+    work, n = 0.0, 0.0
+    for label, moment in enumerate(broadcast_from_root(comm, global_sum(comm, moments))):
+        count, centre = moment[0, 0], moment[0, 1:] / moment[0, 0]
+        variance = moment[1:, 1:] / count - np.outer(centre, centre)
+        axes = np.hstack([np.linalg.eigh(variance)[1], np.eye(3)])
+        own = x[nodes[body_of_cell == label]] @ axes - centre @ axes
+        # The mean number of cells that a plane cuts, over a layer around the centroid.
+        half = _LAYER_RATIO * np.sqrt(np.einsum("ia,ij,ja->a", axes, variance, axes))
+        low, high = (np.clip(end(own, axis=1), -half, half) for end in (np.min, np.max))
+        cut = np.append(np.sum(high - low, axis=0) / (2.0 * half), len(own))
+        *cells_cut, n_cells = broadcast_from_root(comm, global_sum(comm, cut))
+        section = min(cells_cut) * count / n_cells / degree
+        work, n = work + count * section**2, n + count
     return float(dofmap.bs * (work / n) ** (3 / 4))
 
 
