@@ -231,6 +231,7 @@ def test_chosen_where_it_is_quicker():
     assert not linear.is_multigrid_faster(1_000_000, 2)
 
 
+@pytest.mark.mpi
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("degree", [1, 2])
 def test_bodies_count_as_much_as_they_cost_to_factor(turned, degree):
@@ -257,6 +258,7 @@ def test_bodies_count_as_much_as_they_cost_to_factor(turned, degree):
         assert found == pytest.approx(3 * work ** (3 / 4), rel=1e-9)
 
 
+@pytest.mark.mpi
 def test_small_cells_in_the_middle_count():
     """Twice as many cells across at the centre as on average: twice the cross-section."""
     even, fine = np.linspace(-1.0, 1.0, 13), np.linspace(-1.0, 1.0, 13)
