@@ -2,6 +2,7 @@
 
 import logging
 
+import gmsh
 import numpy as np
 import pytest
 import ufl
@@ -258,20 +259,40 @@ def test_bodies_count_as_much_as_they_cost_to_factor(turned, degree):
         assert found == pytest.approx(3 * work ** (3 / 4), rel=1e-9)
 
 
+def cube(size):
+    """A cube of gmsh's tetrahedra, of a size by the distance from the middle."""
+    gmsh.initialize()
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
+        if COMM.rank == 0:
+            body = gmsh.model.occ.addBox(-0.5, -0.5, -0.5, 1.0, 1.0, 1.0)
+            gmsh.model.occ.synchronize()
+            gmsh.model.addPhysicalGroup(3, [body], 1)
+            gmsh.model.mesh.setSizeCallback(lambda d, t, *x_lc: size(np.linalg.norm(x_lc[:3])))
+            gmsh.model.mesh.generate(3)
+        return fc.model_to_mesh(gmsh.model, COMM, gdim=3)[0]
+    finally:
+        gmsh.finalize()
+
+
 @pytest.mark.mpi
-def test_small_cells_in_the_middle_count():
-    """Twice as many cells across at the centre as on average: twice the cross-section."""
-    even, fine = np.linspace(-1.0, 1.0, 13), np.linspace(-1.0, 1.0, 13)
-    fine = 0.5 * fine + 0.5 * fine**3  # half the size at the centre
-    sizes = []
-    for line in (even, fine):
-        mesh, _ = boxes([[2 * even, line, line]], {})
-        space = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
-        sizes.append(linear.cube_size(space, connected_bodies(space)[1], 1))
-    assert sizes[1] == pytest.approx(sizes[0], rel=1e-9)  # as many cells across
-    mesh, _ = boxes([[2 * fine, even, even]], {})
+@pytest.mark.parametrize("graded", [False, True])
+def test_small_cells_in_the_middle_count(graded):
+    """The cells that planes through the middle cut, counted one by one, to 15 %: a layer of planes.
+
+    By them a cube with small cells in the middle counts as more than its own number of unknowns.
+    """
+    mesh = cube((lambda r: 0.04 + 0.2 * r) if graded else (lambda r: 0.1))
     space = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
-    assert linear.cube_size(space, connected_bodies(space)[1], 1) == pytest.approx(sizes[0])
+    n = space.dofmap.index_map.size_global
+    cells = mesh.topology.index_map(3)
+    x = mesh.geometry.x[mesh.geometry.dofmap[: cells.size_local]]
+    cut = np.sum((x.min(axis=1) < 0.0) & (x.max(axis=1) > 0.0), axis=0)
+    section = COMM.allreduce(cut).min() * n / cells.size_global
+    found = linear.cube_size(space, connected_bodies(space)[1], 1)
+    assert found == pytest.approx(3 * section**1.5, rel=0.15)
+    assert (found > 1.5 * 3 * n) == graded
 
 
 def test_chosen_by_the_number_of_increments(monkeypatch):
