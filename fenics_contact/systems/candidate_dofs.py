@@ -76,9 +76,9 @@ def select_nearest_dofs(
     Args:
         operators: Contact operators over all unknowns.
         unknowns: All unknowns.
-        away: `distances` of every contact.
+        away: `compute_contact_distances` of every contact.
         wanted: Largest number of unknowns on all ranks, exceeded only by those of active points and
-            points without a gap.
+            points with a gap of zero or less.
         round_off: Round-off of the distances: points that tie with the last one are included
             (length).
     """

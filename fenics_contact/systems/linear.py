@@ -55,12 +55,13 @@ _LU_RATIO = 1.8
 _MAX_MEMORY_RATIO = 0.5
 # `cube_size` from which multigrid is faster in three dimensions; in two MUMPS always is.
 _MULTIGRID_SIZE = 12_000
-# Thickness of the layer in which `cube_size` counts cells, by the standard deviation of the nodes.
-_LAYER_RATIO = 0.2
 # The same per increment if one factorisation condenses for all. Time of multigrid for an increment
 # by that of condensing a block under a ball: 1.4 for 41,000 unknowns of equal cells, 0.8 for
 # 108,000; 0.5 for 29,000 of gmsh cells graded 1:6, whose `cube_size` is 42,000.
 _SIZE_PER_INCREMENT = 40_000
+# Half the thickness of the layer in which `cube_size` counts cells, by the standard deviation of
+# the nodes.
+_LAYER_RATIO = 0.2
 
 # MUMPS' errors INFOG(1) for insufficient workspace or memory.
 _MEMORY_ERRORS = (-5, -7, -8, -9, -11, -13, -14, -15, -17, -18, -19, -20)
@@ -220,33 +221,29 @@ def cube_size(space: fem.FunctionSpace, body: npt.NDArray[np.intp], degree: int)
         degree: Polynomial degree of the displacement.
     """
     mesh, dofmap = space.mesh, space.dofmap
-    comm, n_owned = mesh.comm, dofmap.index_map.size_local
+    comm, n_owned, n = mesh.comm, dofmap.index_map.size_local, dofmap.index_map.size_global
     x = space.tabulate_dof_coordinates()
     # Relative to the mean, against cancellation far from the origin.
-    x = x - global_sum(comm, x[:n_owned].sum(axis=0)) / dofmap.index_map.size_global
-    n_bodies = 1 + int(global_max(comm, body[:n_owned].astype(np.float64)))
+    x = x - global_sum(comm, x[:n_owned].sum(axis=0)) / n
+    owned, label = np.insert(x[:n_owned], 0, 1.0, axis=1), body[:n_owned]
+    n_bodies = 1 + int(global_max(comm, label.astype(np.float64)))
     moments = np.zeros((n_bodies, 4, 4))  # sums of the products of (1, x)
-    np.add.at(
-        moments,
-        body[:n_owned],
-        np.einsum("pi,pj->pij", *[np.insert(x[:n_owned], 0, 1.0, axis=1)] * 2),
-    )
-    n_cells = mesh.topology.index_map(mesh.topology.dim).size_local
-    nodes = dofmap.list[:n_cells]
-    body_of_cell = body[nodes[:, 0]] if n_cells else np.zeros(0, dtype=np.intp)
-    work, n = 0.0, 0.0
-    for label, moment in enumerate(broadcast_from_root(comm, global_sum(comm, moments))):
-        count, centre = moment[0, 0], moment[0, 1:] / moment[0, 0]
-        variance = moment[1:, 1:] / count - np.outer(centre, centre)
+    np.add.at(moments, label, np.einsum("pi,pj->pij", owned, owned))
+    nodes = dofmap.list[: mesh.topology.index_map(mesh.topology.dim).size_local]
+    body_of_cell = body[nodes[:, 0]]
+    work = 0.0
+    for number, moment in enumerate(broadcast_from_root(comm, global_sum(comm, moments))):
+        n_nodes, centre = moment[0, 0], moment[0, 1:] / moment[0, 0]
+        variance = moment[1:, 1:] / n_nodes - np.outer(centre, centre)
         axes = np.hstack([np.linalg.eigh(variance)[1], np.eye(3)])
-        own = x[nodes[body_of_cell == label]] @ axes - centre @ axes
+        cells = x[nodes[body_of_cell == number]] @ axes - centre @ axes
         # The mean number of cells that a plane cuts, over a layer around the centroid.
         half = _LAYER_RATIO * np.sqrt(np.einsum("ia,ij,ja->a", axes, variance, axes))
-        low, high = (np.clip(end(own, axis=1), -half, half) for end in (np.min, np.max))
-        cut = np.append(np.sum(high - low, axis=0) / (2.0 * half), len(own))
-        *cells_cut, n_cells = broadcast_from_root(comm, global_sum(comm, cut))
-        section = min(cells_cut) * count / n_cells / degree
-        work, n = work + count * section**2, n + count
+        low, high = (np.clip(end(cells, axis=1), -half, half) for end in (np.min, np.max))
+        cut = np.append(np.sum(high - low, axis=0) / (2.0 * half), len(cells))
+        *n_cut, n_cells = broadcast_from_root(comm, global_sum(comm, cut))
+        section = min(n_cut) * n_nodes / n_cells / degree
+        work += n_nodes * section**2
     return float(dofmap.bs * (work / n) ** (3 / 4))
 
 
