@@ -53,7 +53,7 @@ class Verifier:
         self._warned_errors: dict[str, float] = {}
         self._warned_round_off: set[str] = set()
         self._warned_resolution: set[tuple[str, str]] = set()
-        products = np.array([motions.by_body(full, motion) for motion in motions.of_bodies])
+        products = np.array([motions.by_body(motion) for motion in motions.of_bodies])
         products = np.moveaxis(products, 0, 2)
         # The pseudo-inverse serves bodies of one node, without rotations.
         self._inverse = np.linalg.pinv(global_sum(self._comm, products), hermitian=True)
@@ -169,7 +169,7 @@ class Verifier:
         """Return the `Verdict.deformation` of every body. Collective."""
         full, scales, motions = self._full, self._full.scales, self._motions
         state = full.state()
-        sums = global_sum(self._comm, motions.by_body(full, state))
+        sums = global_sum(self._comm, motions.by_body(state))
         rigid = np.einsum("bmn,bn->bm", self._inverse, sums)
         deformation = scales.largest(state - motions.field(rigid))
         spread: Array = np.zeros(len(rigid))
@@ -192,7 +192,7 @@ class Verifier:
             The sums, (n_bodies, n_per_body) (force), as of `RigidBodyModes.work`; the number of
             unknowns and the sum of the absolute ``forces`` of every body, (2, n_bodies).
         """
-        total = self._motions.by_body(system, internal)
+        total = self._motions.by_body_on(system, internal)
         n = len(total)
         for operator in self._full.operators:
             contact = operator.contact

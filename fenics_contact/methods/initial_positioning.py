@@ -116,7 +116,7 @@ class InitialPositioning:
         """Find the free modes of bodies without closed points. Collective."""
         contacts, motions = self.full.contacts, self.motions
         touched: Array = np.zeros(len(motions.free))
-        all_jumps = self._evaluate(np.arange(len(motions.free)))[1]
+        all_jumps = self._at_points(np.arange(len(motions.free)))
         for contact, jumps in zip(contacts, all_jumps, strict=True):
             closed = contact.status != Status.OPEN
             touched += (np.abs(jumps[:, closed]) > NEGLIGIBLE).any(axis=(1, 2))
@@ -142,7 +142,7 @@ class InitialPositioning:
                 if self._find_rest_position(modes):
                     coefficients = self._fit_obstacle_motion(modes, motions)
                     for contact, jumps in zip(
-                        full.contacts, self._evaluate(of_bodies)[1], strict=True
+                        full.contacts, self._at_points(of_bodies), strict=True
                     ):
                         contact.states.set_slip_reference(_find_displaced(jumps))
             full.evaluate_at(initial)
@@ -158,7 +158,7 @@ class InitialPositioning:
         work: Array = np.zeros(len(modes))
         scales = self.full.scales
         for number, (contact, jumps, motion) in enumerate(
-            zip(self.full.contacts, self._evaluate(modes)[1], obstacles, strict=True)
+            zip(self.full.contacts, self._at_points(modes), obstacles, strict=True)
         ):
             touches = contact.values.opening <= FLAT * scales.size_at_points(number)
             weights = np.where(contact.paired & touches, contact.measure, 0.0)
@@ -195,24 +195,18 @@ class InitialPositioning:
             self._displace(modes, motion)
         return motion is not None
 
-    def _evaluate(self, modes: Index) -> tuple[Array, list[Array]]:
-        """Evaluate free modes at local unknowns and at the points of the contacts. Collective.
-
-        Returns:
-            (n_free, n_local), and for every contact (n_free, n_points, gdim).
-        """
-        fields, at_points = self.motions.present(self.full.operators)
-        return fields[modes], [jumps[modes] for jumps in at_points]
+    def _at_points(self, modes: Index) -> list[Array]:
+        """Return jumps of free modes by contact, (n_modes, n_points, gdim). Collective."""
+        return [jumps[modes] for jumps in self.motions.present_at_points(self.full.operators)]
 
     def _find_free_modes(self, modes: Index) -> _FreeModes | None:
         """Evaluate the free modes; None if they are unloaded. Collective."""
-        comm = self.full.unknowns.comm
-        fields, jumps = self._evaluate(modes)
-        load = global_sum(comm, fields @ self.load)
+        load = self.motions.present_products(self.load)[modes]
         largest = np.abs(load).max()
-        gram = global_sum(comm, fields @ fields.T)
+        gram = self.motions.present_gram()[np.ix_(modes, modes)]
         kinematics = [contact.contact_kinematics for contact in self.full.contacts]
-        jumps = [o.rotate_to_displaced(j) for o, j in zip(kinematics, jumps, strict=True)]
+        at_points = self._at_points(modes)
+        jumps = [o.rotate_to_displaced(j) for o, j in zip(kinematics, at_points, strict=True)]
         return _FreeModes(modes, load / largest, gram, jumps) if largest > 0 else None
 
     def _displace(self, modes: Index, coefficients: Array) -> None:

@@ -60,7 +60,7 @@ def find_ejected_bodies(
     if not unloaded.any():
         return {}
     change = full.state() - initial
-    translations, counts = (motions.by_body(full, each) for each in (change, np.ones_like(change)))
+    translations, counts = (motions.by_body(each) for each in (change, np.ones_like(change)))
     sums = np.column_stack([translations[:, : full.gdim], counts[:, 0]])
     sums = global_sum(full.unknowns.comm, sums)
     if not np.isfinite(sums).all():

@@ -13,7 +13,7 @@ import scipy.linalg
 import scipy.optimize
 
 from fenics_contact.contact.values import PointValues
-from fenics_contact.parallel import broadcast_from_root, gather_rows, global_sum
+from fenics_contact.parallel import broadcast_from_root, gather_rows
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.tolerances import FLAT, NEGLIGIBLE, ROUND_OFF
@@ -53,7 +53,7 @@ def find_least_motion(
         Change in free motions, (n_free,) (length); None if the constraints are infeasible.
     """
     comm, scales = full.unknowns.comm, full.scales
-    fields, at_points = motions.present(full.operators)
+    at_points = motions.present_at_points(full.operators)
     rows = [np.zeros((0, len(modes) + 1))]
     closed = closed or [np.zeros(len(values.gap)) for values in states]
     points = zip(full.operators, at_points, states, among, closed, strict=True)
@@ -70,7 +70,7 @@ def find_least_motion(
         limit = np.where(is_touching, 0.0, gap - NEGLIGIBLE * size)
         rows.append(np.column_stack([closing, limit])[is_coupled])
     limits = gather_rows(comm, np.concatenate(rows))
-    mass = global_sum(comm, fields @ fields.T)
+    mass = motions.present_gram()
     turns = motions.free * (motions.turns > 0.0)
     norm = modes @ (mass + _ROTATION_WEIGHT * mass.max() * turns @ turns.T)
     change = minimise_norm(norm @ modes.T, norm @ displacement, limits[:, :-1], limits[:, -1])

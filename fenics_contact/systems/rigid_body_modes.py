@@ -39,7 +39,7 @@ class RigidBodyModes(RigidMotions):
 
         Energies of the bulk tangent without conditions are relative to the stiffness of the body.
         """
-        n_obstacles, system = self._unknowns.n_motions, self._full
+        n_obstacles = self._unknowns.n_motions
         stiffest = np.append(self._scales.stiffness, np.ones(n_obstacles))[self._scales.label]
         gram = []
         work, image = stiffness.createVecs()
@@ -47,8 +47,8 @@ class RigidBodyModes(RigidMotions):
             work.array[:] = motion  # all bodies at once: the bulk does not couple them
             stiffness.mult(work, image)
             fixed = np.where(constrained, motion, 0.0)
-            energy = self.by_body(system, image.array / stiffest + fixed)
-            gram.append([energy, self.by_body(system, motion)])
+            energy = self.by_body(image.array / stiffest + fixed)
+            gram.append([energy, self.by_body(motion)])
         energy, mass = np.moveaxis(global_sum(self.comm, np.array(gram)), 0, 3)
         free: list[Array] = []
         for body_energy, body_mass in zip(energy, mass, strict=True):
@@ -70,7 +70,7 @@ class RigidBodyModes(RigidMotions):
         """Return the jumps of the free motions, (n_free, n_points, gdim). Collective."""
         if operator not in self._jumps or operator.contact.free_angle is not None:
             gdim, n_points = len(self._centres[0]), operator.contact.quadrature.n_points
-            jumps = [operator.jump(self.field(*self._split(row))) for row in self.free]
+            jumps = [operator.jump(self.matrix.T @ row) for row in self.free]
             self._jumps[operator] = np.array(jumps).reshape(len(self.free), n_points, gdim)
         return self._jumps[operator]
 
@@ -118,25 +118,26 @@ class RigidBodyModes(RigidMotions):
         return np.abs(self._split(coefficients @ self.free)[0]).sum(axis=1)
 
     def present_fields(self) -> Array:
-        """Return the free motions at the present positions, (n_free, n_local).
+        """Return the free motions at the present positions, (n_free, n_local)."""
+        return np.asarray((self.present_matrix().T @ self.free.T).T)
 
-        For a linear bulk they are those of the undeformed bodies: only small rotations are rigid.
-        """
-        of_bodies = None if self._full.bulk.linear else self._of_bodies_at(self._node_positions())
-        fields = [self.field(*self._split(row), of_bodies=of_bodies) for row in self.free]
-        return np.array(fields).reshape(len(self.free), self._unknowns.n_local)
-
-    def present(self, operators: Sequence[ContactOperator]) -> tuple[Array, list[Array]]:
-        """Return the free motions at the unknowns and at contact points. Collective.
-
-        These are `present_fields`, and for every contact their jumps, (n_free, n_points, gdim).
-        """
-        fields = self.present_fields()
+    def present_at_points(self, operators: Sequence[ContactOperator]) -> list[Array]:
+        """Return the jumps of `present_fields` by contact, (n_free, n_points, gdim). Collective."""
         if self._full.bulk.linear:
-            return fields, [self.at_points(operator) for operator in operators]
-        shape = len(self.free), -1, self._x.shape[1]
-        jumps = [np.array([o.jump(field) for field in fields]) for o in operators]
-        return fields, [each.reshape(shape) for each in jumps]
+            return [self.at_points(operator) for operator in operators]
+        shape, matrix = (len(self.free), -1, self._x.shape[1]), self.present_matrix()
+        fields = [matrix.T @ row for row in self.free]
+        return [np.array([o.jump(field) for field in fields]).reshape(shape) for o in operators]
+
+    def present_gram(self) -> Array:
+        """Return the products of `present_fields` with each other, (n_free, n_free). Collective."""
+        matrix = self.present_matrix()
+        products = global_sum(self.comm, (matrix @ matrix.T).toarray())
+        return np.asarray(self.free @ products @ self.free.T)
+
+    def present_products(self, values: Array) -> Array:
+        """Return the products of `present_fields` with values, (n_free,). Collective."""
+        return np.asarray(self.free @ global_sum(self.comm, self.present_matrix() @ values))
 
     def fit(self, change: Array, part: Callable[[Array], Array]) -> Array:
         """Fit free motions to a change of this rank's unknowns, (n_free,). Collective.
@@ -155,7 +156,7 @@ class RigidBodyModes(RigidMotions):
         """
         all_motions = coefficients @ self.free
         linear = self._full.bulk.linear
-        return self.field(*self._split(all_motions)) if linear else self.rotate(all_motions)
+        return self.matrix.T @ all_motions if linear else self.rotate(all_motions)
 
     def is_constrained(self, operators: Sequence[ContactOperator]) -> bool:
         """Return whether active points constrain every free motion. Collective.
@@ -222,7 +223,7 @@ class RigidBodyModes(RigidMotions):
         gram: Array = np.zeros((n, n))
         area: Array = np.zeros(n)
         unknown: Array = np.zeros(scales.n_groups)
-        at_points = self.present(operators)[1]
+        at_points = self.present_at_points(operators)
         for number, (operator, modes) in enumerate(zip(operators, at_points, strict=True)):
             contact, weights = operator.contact, operator.contact.quadrature.weights
             has_jump = np.abs(modes).max(axis=2, initial=0.0) > NEGLIGIBLE
@@ -284,7 +285,7 @@ class RigidBodyModes(RigidMotions):
 
     def generalised_forces(self, forces: Array) -> Array:
         """Return the work of forces on the free motions, (n_free,). Collective."""
-        return global_sum(self.comm, self.free @ self._sum_products(forces))
+        return global_sum(self.comm, self.free @ (self.matrix @ forces))
 
     def load_resultant(
         self, load: Array, operators: Sequence[ContactOperator]
@@ -298,12 +299,16 @@ class RigidBodyModes(RigidMotions):
             operators: Operators of evaluated contacts, over all unknowns.
 
         Returns:
-            The generalised load, 0 where it is round-off, and its bound if all forces acted along
-            the mode: (n_straight,) (force) each.
+            The generalised load, 0 where it is round-off, and a bound of its size: (n_straight,)
+            (force) each.
         """
         rows = self.find_state_independent_modes()
-        bounds = self._sum_products(np.abs(load), np.abs(self.of_bodies))
-        sums = np.stack([self.free @ self._sum_products(load), np.abs(self.free) @ bounds])[:, rows]
+        # No motion of a part displaces any of its dofs by more than one.
+        n_obstacles, n_per_body = self._unknowns.n_motions, len(self.of_bodies)
+        sizes = np.bincount(self._scales.label, np.abs(load), minlength=len(self._scales.group))
+        repeats = np.append(np.full(self._n_bodies, n_per_body), np.ones(n_obstacles, dtype=int))
+        bounds = np.abs(self.free) @ np.repeat(sizes, repeats)
+        sums = np.stack([self.free @ (self.matrix @ load), bounds])[:, rows]
         for operator in operators:
             contact = operator.contact
             if not contact.law.has_normal_stiffness:

@@ -6,6 +6,7 @@ import weakref
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse
 
 from fenics_contact import compat
 from fenics_contact.systems.full import FullSystem
@@ -37,6 +38,8 @@ class RigidMotions:
         is_obstacle_rotation: Mask of the rotations of obstacles, whose arms depend on the state.
         of_bodies: Translations, then rotations, of the undeformed bodies: at each of this rank's
             unknowns those of its own body, (n_per_body, n_local).
+        matrix: All motions of the undeformed bodies, sparse, (n_motions, n_local): those of the
+            first body, of the second, ..., and of the obstacles.
     """
 
     def __init__(self, full: FullSystem) -> None:
@@ -59,6 +62,7 @@ class RigidMotions:
         self.turns = np.array(lengths + [0.0] * len(obstacles))
         self.is_obstacle_rotation = np.array(is_obstacle_rotation, dtype=np.bool_)
         self.of_bodies = self._of_bodies_at(x)
+        self.matrix = self._assemble_matrix(self.of_bodies)
         self._displacements: weakref.WeakKeyDictionary[ContactOperator, list[tuple[Index, Array]]]
         self._displacements = weakref.WeakKeyDictionary()
 
@@ -70,6 +74,30 @@ class RigidMotions:
         motions = [self._assemble_field(each, zero) for each in rigid_motions(arm, 1.0).values()]
         return np.array(motions)
 
+    def _assemble_matrix(self, of_bodies: Array) -> scipy.sparse.csc_matrix:
+        """Return the `matrix` for motions of the bodies, (n_per_body, n_local)."""
+        by_unknown = np.ascontiguousarray(of_bodies.T)
+        n, (n_local, n_per_body) = self._unknowns.n_dofs, by_unknown.shape
+        # On the rank of the obstacles every motion of one is an unknown.
+        first = self._n_bodies * n_per_body
+        unknown, motion = np.nonzero(by_unknown)
+        rows = self._scales.label[unknown] * n_per_body + motion
+        rows = np.append(rows, first + np.arange(n_local - n))
+        values = np.append(by_unknown[unknown, motion], np.ones(n_local - n))
+        columns = np.append(unknown, np.arange(n, n_local))
+        pointers = np.append(0, np.cumsum(np.bincount(columns, minlength=n_local)))
+        shape = len(self.names), n_local
+        return scipy.sparse.csc_matrix((values, rows, pointers), shape)
+
+    def present_matrix(self) -> scipy.sparse.csc_matrix:
+        """Return the motions at the present positions as `matrix`.
+
+        For a linear bulk they are those of the undeformed bodies: only small rotations are rigid.
+        """
+        if self._full.bulk.linear:
+            return self.matrix
+        return self._assemble_matrix(self._of_bodies_at(self._node_positions()))
+
     def _assemble_field(self, displacement: Array, obstacles: Array) -> Array:
         """Return the unknowns for nodal displacements, (n_nodes, gdim), and obstacles."""
         return self._unknowns.joined(self._displacement.within(displacement.ravel()), obstacles)
@@ -79,40 +107,29 @@ class RigidMotions:
         n_modes = self._n_bodies * len(self.of_bodies)
         return coefficients[:n_modes].reshape(self._n_bodies, -1), coefficients[n_modes:]
 
-    def field(
-        self, by_body: Array, obstacles: Array | None = None, *, of_bodies: Array | None = None
-    ) -> Array:
+    def field(self, by_body: Array) -> Array:
         """Return the displacement field of motions at this rank's unknowns, (n_local,).
 
         Args:
-            by_body: Coefficients of the first k motions of every body, (n_bodies, k).
-            obstacles: Coefficients of the motions of obstacles; None: all are zero.
-            of_bodies: Motions of the bodies, by default those of the undeformed ones.
+            by_body: Coefficients of the first k motions of every undeformed body, (n_bodies, k).
         """
-        motions = self.of_bodies if of_bodies is None else of_bodies
-        n, label = self._unknowns.n_dofs, self._scales.label
-        dofs = np.einsum("im,mi->i", by_body[label[:n]], motions[: by_body.shape[1], :n])
-        zero = np.zeros(self._unknowns.n_motions)
-        return self._unknowns.joined(dofs, zero if obstacles is None else obstacles)
+        coefficients = np.zeros((self._n_bodies, len(self.of_bodies)))
+        coefficients[:, : by_body.shape[1]] = by_body
+        return self.matrix.T @ np.append(coefficients, np.zeros(self._unknowns.n_motions))
 
-    def by_body(self, system: System, values: Array, of_bodies: Array | None = None) -> Array:
-        """Return this rank's products of a system's values with motions, (n_bodies, n_per_body).
+    def by_body(self, values: Array) -> Array:
+        """Return this rank's products of values with motions, (n_bodies, n_per_body)."""
+        return self._split(self.matrix @ values)[0]
 
-        The motions are by default those of the undeformed bodies.
-        """
-        motions, n = self.of_bodies if of_bodies is None else of_bodies, self._n_bodies
-        products = [system.restrict(motion) * values for motion in motions]
+    def by_body_on(self, system: System, values: Array) -> Array:
+        """Return `by_body` for the values of a system of fewer unknowns. Collective."""
+        if system is self._full:
+            return self.by_body(values)
+        n = self._n_bodies
+        products = [system.restrict(motion) * values for motion in self.of_bodies]
         sums = [np.bincount(system.label, p, minlength=n)[:n] for p in products]
-        return np.stack(sums, axis=1).astype(
-            np.float64
-        )  # `bincount` of an empty array is of integers
-
-    def _sum_products(self, values: Array, of_bodies: Array | None = None) -> Array:
-        """Return this rank's products of values with all motions, (n_motions,)."""
-        obstacles = np.zeros(self._unknowns.n_motions)
-        if self._unknowns.has_motions_here:
-            obstacles[:] = values[self._unknowns.n_dofs :]
-        return np.append(self.by_body(self._full, values, of_bodies), obstacles)
+        # `bincount` of an empty array is of integers.
+        return np.stack(sums, axis=1).astype(np.float64)
 
     def rotate(self, coefficients: Array) -> Array:
         """Return the change of the unknowns, (n_local,), for finite motions from the present state.
