@@ -201,7 +201,7 @@ class InitialPositioning:
 
     def _find_free_modes(self, modes: Index) -> _FreeModes | None:
         """Evaluate the free modes; None if they are unloaded. Collective."""
-        load = self.motions.present_products(self.load)[modes]
+        load = self.motions.present_load(self.load)[modes]
         largest = np.abs(load).max()
         gram = self.motions.present_gram()[np.ix_(modes, modes)]
         kinematics = [contact.contact_kinematics for contact in self.full.contacts]

@@ -15,8 +15,9 @@ from fenics_contact.types import Array
 
 __all__ = ["linearised_solver", "solve_response"]
 
-# Relative tolerance for an estimate printed with two digits; residual of a failure.
-_RESPONSE_RTOL, _FAILED_RTOL = 1e-3, 1e-2
+# Relative tolerance, of tractions at fixed displacements, of which stiff contact leaves a small
+# part (1e-3 refuses a right solution with k h/E = 2000 by multigrid); residual of a failure.
+_RESPONSE_RTOL, _FAILED_RTOL = 1e-4, 1e-2
 
 
 @contextmanager

@@ -135,9 +135,25 @@ class RigidBodyModes(RigidMotions):
         products = global_sum(self.comm, (matrix @ matrix.T).toarray())
         return np.asarray(self.free @ products @ self.free.T)
 
-    def present_products(self, values: Array) -> Array:
-        """Return the products of `present_fields` with values, (n_free,). Collective."""
-        return np.asarray(self.free @ global_sum(self.comm, self.present_matrix() @ values))
+    def present_load(self, load: Array) -> Array:
+        """Return the work of a load on `present_fields`, 0 where it is round-off. Collective.
+
+        Args:
+            load: External forces at this rank's unknowns (force).
+
+        Returns:
+            Array (n_free,) (force).
+        """
+        sums = np.stack([self.free @ (self.present_matrix() @ load), self._bound_work(load)])
+        return _without_round_off(*global_sum(self.comm, sums))
+
+    def _bound_work(self, load: Array) -> Array:
+        """Return this rank's part of a bound of the work of a load on free modes, (n_free,)."""
+        # No motion of a part displaces any of its dofs by more than one.
+        sizes = np.bincount(self._scales.label, np.abs(load), minlength=len(self._scales.group))
+        n_obstacles, n_per_body = self._unknowns.n_motions, len(self.of_bodies)
+        repeats = np.append(np.full(self._n_bodies, n_per_body), np.ones(n_obstacles, dtype=int))
+        return np.asarray(np.abs(self.free) @ np.repeat(sizes, repeats))
 
     def fit(self, change: Array, part: Callable[[Array], Array]) -> Array:
         """Fit free motions to a change of this rank's unknowns, (n_free,). Collective.
@@ -303,12 +319,7 @@ class RigidBodyModes(RigidMotions):
             (force) each.
         """
         rows = self.find_state_independent_modes()
-        # No motion of a part displaces any of its dofs by more than one.
-        n_obstacles, n_per_body = self._unknowns.n_motions, len(self.of_bodies)
-        sizes = np.bincount(self._scales.label, np.abs(load), minlength=len(self._scales.group))
-        repeats = np.append(np.full(self._n_bodies, n_per_body), np.ones(n_obstacles, dtype=int))
-        bounds = np.abs(self.free) @ np.repeat(sizes, repeats)
-        sums = np.stack([self.free @ (self.matrix @ load), bounds])[:, rows]
+        sums = np.stack([self.free @ (self.matrix @ load), self._bound_work(load)])[:, rows]
         for operator in operators:
             contact = operator.contact
             if not contact.law.has_normal_stiffness:
@@ -318,7 +329,7 @@ class RigidBodyModes(RigidMotions):
                 )
                 sums += np.stack([-normal @ force, np.abs(normal) @ force])
         resultant, size = global_sum(self.comm, sums)
-        return np.where(np.abs(resultant) <= NEGLIGIBLE * size, 0.0, resultant), size
+        return _without_round_off(resultant, size), size
 
     def groups(self) -> Index:
         """Return the group of coupled parts that each free motion moves, (n_free,)."""
@@ -332,6 +343,11 @@ class RigidBodyModes(RigidMotions):
             largest, self.groups()[self.find_state_independent_modes()], np.abs(resultants)
         )
         return largest
+
+
+def _without_round_off(work: Array, bound: Array) -> Array:
+    """Return the work of a load on modes, 0 where it is negligible relative to its bound."""
+    return np.where(np.abs(work) <= NEGLIGIBLE * bound, 0.0, work)
 
 
 def _reduce_rows(rows: Array) -> Array:
