@@ -1,4 +1,4 @@
-"""Accuracy in one word: what it chooses, what wins over it, whether the error is as wanted."""
+"""Tests of ``accuracy``: its choices, arguments that override it, and the resulting error."""
 
 import itertools
 
@@ -18,14 +18,14 @@ COMM = MPI.COMM_WORLD
 
 
 def press(law=None, **contact) -> Aslant:
-    """Quadratic cells."""
+    """Return a scene of quadratic cells, solved by Newton's method."""
     law = law or fc.Coulomb(0.3)
     return Aslant(law, degree=2, mesh={"n": 8}, contact=contact, method="newton")
 
 
 @pytest.fixture(scope="module")
 def truth():
-    """Forces with multipliers to 1e-8 and 200 increments."""
+    """Return reference quantities, with multipliers to 1e-8 and 200 increments."""
     made = press(
         fc.Coulomb(0.3, fc.RelativeStiffness(10), fc.RelativeStiffness(10)),
         enforcement="augmented",
@@ -36,8 +36,8 @@ def truth():
 
 
 @pytest.mark.parametrize("wanted", [*PRESETS, 3e-3])
-def test_the_error_is_as_wanted(wanted, truth):
-    """But for the mesh, which is the same: normal and friction force and peak pressure."""
+def test_error_is_within_the_requested_accuracy(wanted, truth):
+    """Normal force, friction force and peak pressure have the requested error, on equal meshes."""
     made = press(accuracy=wanted)
     steps = made.run()
     accuracy = fc.Accuracy.of(wanted)
@@ -47,8 +47,8 @@ def test_the_error_is_as_wanted(wanted, truth):
         assert abs(found[name] / truth[name] - 1) <= accuracy.error, name
 
 
-def test_choices():
-    """Less error takes no less of anything; multipliers take over where stiffness gets dear."""
+def test_choices_are_monotonic_in_the_requested_error():
+    """Smaller errors relax no choice; multipliers are used where stiffness would be expensive."""
     chosen = [fc.Accuracy.of(error) for error in (0.5, 0.05, 0.01, 1e-3, 1e-6, 1e-8)]
     for rough, fine in itertools.pairwise(chosen):
         assert fine.factor >= rough.factor
@@ -60,8 +60,8 @@ def test_choices():
     assert "augmented" in str(chosen[-1]) and "1e-08" in str(chosen[-1])
 
 
-def test_what_is_given_wins():
-    """Stiffness, enforcement, tolerance, solver and increments of the caller's own."""
+def test_explicit_arguments_override_the_accuracy():
+    """Stiffness, enforcement, tolerance and number of increments given by the caller are used."""
     made = press(
         fc.Coulomb(0.3, k_n=fc.RelativeStiffness(7), k_t=1e3),
         accuracy="fine",
@@ -80,15 +80,15 @@ def test_what_is_given_wins():
     assert given.tolerance == 1e-3 and given.multipliers is not None
 
 
-def test_physical_stiffness_stays():
-    """A foundation is none of the regularisation's business: no multipliers, no other stiffness."""
+def test_accuracy_does_not_change_physical_stiffness():
+    """A foundation is not a regularisation: it keeps its stiffness and has no multipliers."""
     made = press(fc.Foundation(1e4, 1e3), accuracy="fine").contact
     assert made.multipliers is None
     assert float(made.parameters["k_n"].value) == 1e4
 
 
-def test_the_strictest_of_several():
-    """The solver stops where the contact that wants most is content; all must have said one."""
+def test_strictest_contact_determines_the_solver_tolerance():
+    """The solver's tolerance is that of the strictest contact, if all state an accuracy."""
     for words, error in ((("draft", "fine"), 1e-3), (("draft", None), None)):
         scene = block("triangle", 1, n=2, up=-1.0)
         contacts = [
@@ -100,11 +100,11 @@ def test_the_strictest_of_several():
         assert problem.snes.getTolerances()[0] == rtol
 
 
-def test_the_mesh_it_takes():
-    """On the mesh that the budget asks for, the error of discretisation is as wanted, within 2.
+def test_recommended_mesh_has_the_requested_error():
+    """On the mesh that the budget recommends the error is at most twice the requested one.
 
-    The estimate's rates are those of a contact that ends in the middle of cells; a mesh may be
-    lucky or not.
+    The estimated rates are those of a contact zone that ends in the middle of cells; for a given
+    mesh the error may be smaller or larger.
     """
     wanted = 5e-3
     made = press(fc.Frictionless(), accuracy=wanted)
@@ -128,6 +128,6 @@ def test_the_mesh_it_takes():
 
 @pytest.mark.whole
 @pytest.mark.parametrize("wanted", ["best", 0.0, -1.0, 2.0, float("nan"), [0.1, 0.2]])
-def test_other_words(wanted):
-    """No such word, or no relative error: said on all ranks, with those there are."""
+def test_wrong_accuracies_are_refused(wanted):
+    """Unknown words and invalid errors are refused on all ranks, with a list of the choices."""
     raised_everywhere(lambda: press(accuracy=wanted), ValueError, "standard", "between")

@@ -1,7 +1,7 @@
-"""Values along Γc of plane bodies: every point once, in the order in which Γc has them.
+"""Values along Γc in two dimensions contain every point once, in the order along Γc.
 
-References: the places of the points themselves; angles and arc lengths to 1e-9 of the largest, for
-round-off, but where curved facets are measured along their chord.
+Reference: the positions of the points. Angles and arc lengths agree to 1e-9 of the largest, for
+round-off; curved facets are measured along their chord.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
 def ring(oval=1.0):
-    """A ring of quadrilaterals between the radii 1 and 2, stretched along x."""
+    """Return a ring of quadrilaterals between the radii 1 and 2, stretched along x."""
     angle = np.linspace(0, 2 * np.pi, N, endpoint=False)
     circle = np.column_stack([oval * np.cos(angle), np.sin(angle)])
     x = MIDDLE + np.concatenate([(1 + 0.5 * i) * circle for i in range(3)])
@@ -44,12 +44,12 @@ def ring(oval=1.0):
 
 
 def pin(direction=(0.0, -1.0)):
-    """It is so far from the middle of the hole that about a quarter of it bears."""
+    """Return a pin that is in contact with about a quarter of the hole."""
     return fc.Ball(MIDDLE + 0.1 * np.asarray(direction), 0.92)
 
 
 def evaluated(mesh, tags, which, obstacle):
-    """A contact with the undeformed body, evaluated."""
+    """Return a contact, evaluated for the undeformed body."""
     u = fem.Function(displacement_space(mesh, 1))
     surface = fc.ContactSurface(mesh, tags, which)
     contact = fc.Contact(u, surface, obstacle, fc.Frictionless(1e3))
@@ -58,7 +58,7 @@ def evaluated(mesh, tags, which, obstacle):
 
 
 def check(contact, found, n_curves):
-    """Every point is there once with its values, and each curve goes one way."""
+    """Assert that every point occurs once with its values, and that each curve is monotonic."""
     points = contact.gather()
 
     def compare():
@@ -75,8 +75,8 @@ def check(contact, found, n_curves):
 
 
 @pytest.mark.parametrize("direction", [(0.0, -1.0), (-1.0, 0.0), (0.6, 0.8)])
-def test_a_hole(direction):
-    """The angle about its middle; the pressure has one hump, whatever side the pin is on."""
+def test_circular_hole_is_plotted_over_the_angle(direction):
+    """The angle is exact, and the pressure has a single maximum, at every side of the hole."""
     mesh, tags = ring()
     contact = evaluated(mesh, tags, INNER, pin(direction))
     found = along(contact)
@@ -98,8 +98,8 @@ def test_a_hole(direction):
     on_first(compare)
 
 
-def test_a_ring_with_both_its_surfaces():
-    """Two curves about one middle, each a line of its own."""
+def test_both_surfaces_of_a_ring_give_two_curves():
+    """Inner and outer surface are two curves over the angle about one centre."""
     mesh, tags = ring()
     contact = evaluated(mesh, tags, [INNER, OUTER], fc.Ball(MIDDLE, 1.5, inside=True))
     found = along(contact)
@@ -107,8 +107,8 @@ def test_a_ring_with_both_its_surfaces():
     on_first(lambda: np.testing.assert_equal(found.is_angle, True))
 
 
-def test_an_oval_hole():
-    """The arc length: by its end that of all facets, and each point where it is on them."""
+def test_oval_hole_is_plotted_over_the_arc_length():
+    """The arc length ends at the length of all facets, and increases by chords of facets."""
     mesh, tags = ring(oval=1.5)
     contact = evaluated(mesh, tags, INNER, fc.Ball(MIDDLE - [0, 0.1], 0.95))
     found = along(contact, "m")
@@ -118,11 +118,11 @@ def test_an_oval_hole():
     def compare():
         assert not found.is_angle and "arc length" in found.label and "[m]" in found.label
         assert 0 < found.abscissa.min() and found.abscissa.max() < length
-        # Points of one facet are as far apart as their chord.
+        # The distance of the points of a facet is that along their chord.
         x, s = (v.reshape(N, -1, *v.shape[1:]) for v in (found.values["x"], found.abscissa))
         chord = np.linalg.norm(x[:, -1] - x[:, 0], axis=1)
         assert close(s[:, -1] - s[:, 0], chord, 1e-9)
-        assert close(length, chord.sum() * np.sqrt(3), 1e-9)  # between the points of Gauss
+        assert close(length, chord.sum() * np.sqrt(3), 1e-9)  # chord between the Gauss points
 
     on_first(compare)
 
@@ -138,18 +138,18 @@ def test_an_oval_hole():
         ([BOTTOM, TOP, LEFT, RIGHT], "arc length along Γc", 1),
     ],
 )
-def test_sides_of_a_block(which, label, n_curves):
-    """The coordinate where Γc does not turn back, else the arc length round its corners."""
+def test_abscissa_of_the_sides_of_a_block(which, label, n_curves):
+    """The abscissa is a coordinate if it is monotonic along Γc, otherwise the arc length."""
     mesh, tags = block_mesh("triangle", n=4)
-    obstacle = fc.Ball((0.5, 0.5), 0.505, inside=True)  # bears at the corners, none is cut off
+    obstacle = fc.Ball((0.5, 0.5), 0.505, inside=True)  # in contact at all corners, none cut off
     contact = evaluated(mesh, tags, which, obstacle)
     found = along(contact)
     check(contact, found, n_curves)
     on_first(lambda: np.testing.assert_equal(found.label.startswith(label), True))
 
 
-def test_the_picture(tmp_path, monkeypatch):
-    """What is drawn are these curves: no line from one side of the hole to the other."""
+def test_plot_shows_the_curves(tmp_path, monkeypatch):
+    """The plot contains exactly these curves, without a line across the hole."""
     figures, save = [], drawing.save
     monkeypatch.setattr(drawing, "save", lambda f, path: (figures.append(f), save(f, path)))
     mesh, tags = ring()

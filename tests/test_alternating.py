@@ -1,4 +1,4 @@
-"""Tresca fixed point: the solution of the direct methods, and what these cannot do."""
+"""Tresca fixed-point method: the solution of the direct methods, and very stiff contact."""
 
 from itertools import pairwise
 
@@ -20,8 +20,8 @@ COMM = MPI.COMM_WORLD
 
 
 @pytest.mark.parametrize(("cell", "degree"), GRID)
-def test_the_same_solution(cell, degree):
-    """Both satisfy the whole law to the solver's tolerance of 1e-9: states agree to 1e-6."""
+def test_solution_equals_that_of_newton(cell, degree):
+    """Both methods satisfy the law to the solver's tolerance of 1e-9: solutions agree to 1e-6."""
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
     states = []
     for method in ("alternating", "newton"):
@@ -31,7 +31,7 @@ def test_the_same_solution(cell, degree):
         r = step.contacts["contact"]
         assert r.slip > 0 and not step.verdict.failures
         states.append((nodal(scene.u), r.force))
-        assert contact.history.values("slip").max(initial=0.0) == 0.0  # nothing is committed
+        assert contact.history.values("slip").max(initial=0.0) == 0.0  # not committed
     for a, b in zip(*states, strict=True):
         assert close(a, b, 1e-6)
 
@@ -48,8 +48,8 @@ def test_the_same_solution(cell, degree):
     ],
     ids=["frictionless", "tresca", "polygon", "ellipse", "foundation"],
 )
-def test_every_law(law):
-    """Laws with a potential are one minimum problem; anisotropic friction is like isotropic."""
+def test_every_law_has_the_solution_of_newton(law):
+    """Forces agree to 1e-6 for laws with a potential (one minimum problem) and with friction."""
     forces = []
     for method in ("alternating", "newton"):
         _, problem, _ = pressed("hexahedron", law, method)
@@ -57,8 +57,8 @@ def test_every_law(law):
     assert close(*forces, 1e-6)
 
 
-def test_history_and_increments():
-    """Over a cycle of loads both methods keep the same history."""
+def test_load_cycle_has_the_same_history():
+    """After a load cycle both methods have the same history, to 1e-5."""
     ends = []
     for method in ("alternating", "lbfgs"):
         law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
@@ -68,8 +68,8 @@ def test_history_and_increments():
     assert close(*ends, 1e-5)
 
 
-def test_a_body_held_by_friction_alone():
-    """Nothing but friction holds the block: the normal problem alone would leave it loose."""
+def test_block_constrained_by_friction_only():
+    """Without friction the block has a rigid-body mode; forces are those of Newton, to 1e-6."""
     forces = []
     for method in ("alternating", "newton"):
         scene = block("triangle", 1, n=4, up=-1.0, side=0.15)
@@ -78,8 +78,8 @@ def test_a_body_held_by_friction_alone():
     assert close(*forces, 1e-6)
 
 
-def test_a_driven_obstacle():
-    """An obstacle that is pressed by a force, and then dragged by another."""
+def test_force_driven_obstacle_has_the_motion_of_newton():
+    """An obstacle pressed by a force, and then dragged by another, has the same motion, to 1e-6."""
     motions = []
     for method in ("alternating", "newton"):
         scene = block("quadrilateral", 1, n=4)
@@ -97,10 +97,10 @@ def test_a_driven_obstacle():
 
 @pytest.mark.parametrize("condensation", [False, None])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_the_residual_is_the_gradient_of_the_energy(cell, condensation):
-    """With the friction bound given: central differences, 1e-6.
+def test_residual_is_the_gradient_of_the_energy(cell, condensation):
+    """At a fixed friction bound the residual is the central difference of the energy, to 1e-6.
 
-    On all unknowns, and on those of contact alone where that is the choice.
+    The equations are those of all dofs, or after static condensation by default.
     """
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
     scene, problem, contact = pressed(cell, law, "newton", side=0.03, condensation=condensation)
@@ -128,11 +128,11 @@ def test_the_residual_is_the_gradient_of_the_energy(cell, condensation):
 
 
 @pytest.mark.parametrize(("factor", "friction"), [(1e6, 0.0), (1e8, 0.0), (1e4, 0.3)])
-def test_stiff_contact_from_a_cold_start(factor, friction):
-    """k_n h/E up to 1e8, with friction to 1e4, in one increment: penetration is next to none.
+def test_stiff_contact_is_solved_in_one_increment(factor, friction):
+    """Contact with k_n h/E up to 1e8, or 1e4 with friction, is solved in one increment.
 
-    At 1e4 and more the pressures are those of hard contact; compared with 1e3, whose error is of
-    the order of 1e-3, to 1e-2.
+    From 1e4 the solution is that of rigid contact: its force agrees with that of 1e3, whose error
+    is of the order of 1e-3, to 1e-2.
     """
     peaks = []
     for scaled in (fc.RelativeStiffness(1e3), fc.RelativeStiffness(factor)):
@@ -146,13 +146,12 @@ def test_stiff_contact_from_a_cold_start(factor, friction):
 
 
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
-def test_each_cycle_gains_a_constant_factor_in_proportion_to_friction(cell, monkeypatch):
-    """The friction bound is a multiple of the pressure, which what changes in it changes back.
+def test_convergence_is_linear_with_a_rate_proportional_to_friction(cell, monkeypatch):
+    """The fixed point of the friction bound converges linearly, at a rate proportional to μ.
 
-    The same points stick and slip with all of the coefficients. From cycle to cycle the change of
-    the bound falls by one factor, to a twentieth of it: minimum problems are solved to a
-    hundredth of the whole law's residual. Twice the coefficient has twice the factor, to a tenth:
-    the pressure itself is a little different.
+    The same points stick and slip with all three coefficients. The changes of the bound fall by a
+    constant factor, to 5 %, as minimum problems are solved to a hundredth of the residual of the
+    law. Twice the coefficient has twice the factor, to 10 %, as the pressure differs slightly.
     """
     factors, zones = [], []
     for friction in (0.1, 0.2, 0.4):
@@ -179,8 +178,8 @@ def test_each_cycle_gains_a_constant_factor_in_proportion_to_friction(cell, monk
     assert factors[2] == pytest.approx(2 * factors[1], rel=0.1)
 
 
-def test_rationed_iterations_are_not_exceeded():
-    """Who limits the iterations gets no others instead."""
+def test_iteration_limit_of_the_user_prevents_the_fallback():
+    """With an iteration limit by the user no other method is tried."""
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
     _, problem, _ = pressed("triangle", law, "newton", petsc_options={"snes_max_it": 1})
     with pytest.raises(fc.NotConverged) as caught:
@@ -188,16 +187,16 @@ def test_rationed_iterations_are_not_exceeded():
     assert caught.value.reason == PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT
 
 
-def test_its_options_are_reached():
-    """The subproblems' solver takes options under its own prefix."""
+def test_petsc_options_of_the_subproblem_solver():
+    """The solver of the subproblems takes options with the prefix `alternating_`."""
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
     options = {"alternating_snes_max_it": 7}
     _, problem, _ = pressed("triangle", law, "alternating", petsc_options=options)
     assert problem.solver.methods["alternating"].snes.getTolerances()[3] == 7
 
 
-def test_a_nonlinear_bulk():
-    """Without an energy at hand the line search looks at the residual; the solution is the same."""
+def test_nonlinear_bulk_has_the_solution_of_newton():
+    """Without an energy the line search uses the residual; displacements agree to 1e-6."""
     ends = []
     for method in ("alternating", "newton"):
         scene = block("quadrilateral", 1, n=4)

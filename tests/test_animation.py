@@ -1,4 +1,4 @@
-"""Films: frames, their colours and axes, and that none is left half written."""
+"""Animations have correct frames, colours and axes, and are never left partly written."""
 
 import gc
 
@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
 def rubbed(cell):
-    """A block to be pressed and rubbed, and its stress."""
+    """Return the problem of a block that is pressed and sheared, and the block's stress."""
     made = Rub(cell=cell)
     made.problem.small_displacement_tolerance = np.inf
     scene = made.scene
@@ -31,8 +31,8 @@ def rubbed(cell):
 
 
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
-def test_a_frame_is_a_state(cell, tmp_path, monkeypatch):
-    """Every body once, where it was then; one scale of colours, one of axes, a legend."""
+def test_every_frame_shows_one_state(cell, tmp_path, monkeypatch):
+    """Every frame shows the deformed body of its step, with common colours, axes and legend."""
     folder = shared_folder(tmp_path)
     made, sigma = rubbed(cell)
     bodies, colours, axes, figures = [], [], [], []
@@ -43,7 +43,7 @@ def test_a_frame_is_a_state(cell, tmp_path, monkeypatch):
     )
 
     def drawn(corners, faces, *rest):
-        if not isinstance(faces, str):  # as those of obstacles are
+        if not isinstance(faces, str):  # the faces of obstacles are strings
             bodies.append(corners)
             colours.append(faces)
         return polygons(corners, faces, *rest)
@@ -89,11 +89,11 @@ def test_a_frame_is_a_state(cell, tmp_path, monkeypatch):
     del film
     gc.collect()
     COMM.barrier()
-    assert [p.name for p in (folder / "new").iterdir()] == ["film.gif"]  # and nothing beside it
+    assert [p.name for p in (folder / "new").iterdir()] == ["film.gif"]  # no temporary files remain
 
 
-def test_bad_input(tmp_path):
-    """On all ranks, before any work; and nothing is written."""
+def test_invalid_input_is_refused(tmp_path):
+    """Invalid input raises on all ranks, and no file is written."""
     folder = shared_folder(tmp_path)
     made, sigma = rubbed("triangle")
     problem, path = made.problem, folder / "film.gif"
@@ -112,8 +112,8 @@ def test_bad_input(tmp_path):
     assert not path.exists()
 
 
-def test_a_failure_leaves_the_film_before(tmp_path, monkeypatch):
-    """A frame that cannot be drawn: the error on all ranks, the file as it was."""
+def test_failed_save_leaves_the_previous_file(tmp_path, monkeypatch):
+    """If a frame cannot be drawn, all ranks raise, and the file is unchanged."""
     folder = shared_folder(tmp_path)
     made, _ = rubbed("triangle")
     film = fc.Animation(folder / "film.gif", made.problem)

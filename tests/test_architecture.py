@@ -1,4 +1,4 @@
-"""How the package is built: imports run downwards, and nobody reaches into another object."""
+"""Structure of the package: imports of lower layers only, no access to private members."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 ROOT = PACKAGE.parent
 FOLDERS = ("demos", "examples", "scenes", "tests", "benchmarks", "verification", "docs")
 OTHERS = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
-# From below upwards; a room may import from itself and from those before it.
+# Layers from the lowest to the highest; a layer may import from itself and from lower ones.
 ROOMS = [
     "laws",
     "obstacles",
@@ -32,20 +32,20 @@ ROOMS = [
     "histories",
     "__main__",
 ]
-# A method is not to know by what its solution is verified.
+# Solution methods must not depend on the checks that verify their solutions.
 APART = {"methods": {"checks"}}
-# Modules that stand in no room and know none of them.
+# Base modules, which belong to no layer and import from none.
 GROUND = {
     *("compat", "parallel", "types", "meshes", "joining", "arguments", "elasticity", "markup"),
     *("_version", "compiling", "installation", "tolerances", "wording"),
 }
-# DOLFINx names its C++ objects so, and there is no other way to them.
+# DOLFINx's C++ objects are accessible by this private name only.
 OF_DOLFINX = {"_cpp_object"}
-# What Matplotlib has drawn in space is known by these alone.
+# Matplotlib's 3D artists have their data in these private attributes only.
 OF_MATPLOTLIB = {"_segments3d", "_vec", "_faces", "_segslices"}
-# By this name notebooks ask any object how it is shown.
+# Notebooks call this method of an object to display it.
 OF_NOTEBOOKS = {"_repr_html_"}
-# What releases of DOLFINx have by different names or with different arguments.
+# Names or arguments that differ between releases of DOLFINx.
 BY_RELEASE = {
     *("cmap", "cmaps", "dofmaps", "create_submesh", "create_cell_partitioner"),
     *("interpolation_points", "model_to_mesh", "gmshio"),
@@ -58,15 +58,15 @@ KNOWN = {
 
 
 def name(path: Path) -> str:
-    """Of a module, with dots, without the package's."""
+    """Return the dotted name of a module without that of the package."""
     parts = path.relative_to(PACKAGE).with_suffix("").parts
     return ".".join(part for part in parts if part != "__init__")
 
 
 def imported(source: str) -> Iterator[str]:
-    """Modules of the package that a source imports, wherever in it; "" is the package as a whole.
+    """Yield modules of the package that a source imports anywhere; "" is the package itself.
 
-    Without names before the dot a module would stand in no room: it is said as it is written.
+    Relative imports are yielded as they are written, and so belong to no layer.
     """
     known = {name(p) for p in MODULES}
     for node in ast.walk(ast.parse(source)):
@@ -84,19 +84,19 @@ def imported(source: str) -> Iterator[str]:
 
 
 def within(module: str) -> bool:
-    """Whether a module is the package, or of it."""
+    """Return whether a module is the package or a part of it."""
     return module.split(".")[0] == "fenics_contact"
 
 
 def upwards(room: str, source: str) -> set[str]:
-    """Rooms that a source in a room imports from and may not."""
+    """Return layers that a source in a layer imports from against the rules."""
     allowed = {*GROUND} if room in GROUND else {*GROUND, *ROOMS[: ROOMS.index(room) + 1]}
     allowed -= APART.get(room, set())
     return {module.split(".")[0] or module for module in imported(source)} - allowed
 
 
 def circle(needs: Mapping[str, set[str]]) -> set[str]:
-    """Modules that cannot be put in an order in which each imports those before it alone."""
+    """Return modules that cannot be ordered so that each imports only modules before it."""
     left = dict(needs)
     while left:
         ready = {module for module, others in left.items() if not others & left.keys()}
@@ -106,31 +106,31 @@ def circle(needs: Mapping[str, set[str]]) -> set[str]:
     return set()
 
 
-def test_every_module_stands_somewhere():
-    """In a room, or on the ground that all stand on."""
+def test_every_module_belongs_to_a_layer():
+    """Every module is in a layer or is a base module."""
     places = {name(path).split(".")[0] for path in MODULES} - {""}
     assert places == {*ROOMS, *GROUND}
 
 
 def offences(paths: list[Path], find: Callable[[Path], Collection[str]]) -> dict[str, list[str]]:
-    """What is found in files, of those where something is."""
+    """Return the violations by file, for files that have any."""
     found = {str(path.relative_to(ROOT)): sorted(find(path)) for path in paths}
     return {path: what for path, what in found.items() if what}
 
 
-def test_imports_run_downwards():
-    """From a room to itself or to one below, never up; the ground imports ground alone."""
+def test_imports_go_to_lower_layers_only():
+    """A layer imports from itself and lower ones; base modules import base modules only."""
     placed = [path for path in MODULES if name(path)]
     assert not offences(placed, lambda path: upwards(name(path).split(".")[0], path.read_text()))
 
 
-def test_no_circle():
-    """Nor one of imports that are made when they are needed."""
+def test_no_circular_imports():
+    """Imports have no cycle, including imports inside of functions."""
     assert not circle({name(p): set(imported(p.read_text())) - {name(p)} for p in MODULES})
 
 
 def private(node: ast.AST) -> str:
-    """The private name by which something is asked for, as an attribute or in words; or none."""
+    """Return the private name that a node accesses, as an attribute or a string, or ""."""
     asked = ""
     if isinstance(node, ast.Attribute):
         asked = node.attr
@@ -142,12 +142,12 @@ def private(node: ast.AST) -> str:
         given = [a.value for a in node.args if isinstance(a, ast.Constant)]
         if called.endswith("attr") or called in ("attrgetter", "methodcaller"):
             asked = next((value for value in given if isinstance(value, str)), "")
-        asked = asked if asked != asked.upper() else ""  # a test may set a module's threshold
+        asked = asked if asked != asked.upper() else ""  # a test may set a constant of a module
     return asked if re.match("_[A-Za-z]", asked) else ""
 
 
 def touched(source: str, foreign: set[str]) -> list[str]:
-    """Private members of other objects that a source touches, and private names it imports."""
+    """Return accesses to private members of other objects, and imports of private names."""
     tree = ast.parse(source)
     classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
     allowed = {node for each in classes for node in members(each)}
@@ -166,7 +166,7 @@ def touched(source: str, foreign: set[str]) -> list[str]:
 
 
 def members(of: ast.ClassDef) -> Iterator[ast.AST]:
-    """Where a class asks for members of its own: by name, or by annotation."""
+    """Yield accesses of a class to its own members, of self or of annotated arguments."""
     nodes = list(ast.walk(of))
     given = {
         argument.arg
@@ -182,20 +182,20 @@ def members(of: ast.ClassDef) -> Iterator[ast.AST]:
                 yield node
 
 
-def test_nobody_touches_private_members_of_another():
-    """`x._y` is for self, and for another instance in the body of the class that has it."""
+def test_private_members_are_used_by_their_class_only():
+    """`x._y` is allowed for self, and for other instances in the body of their class."""
     own, others = OF_DOLFINX | OF_NOTEBOOKS, OF_DOLFINX | OF_NOTEBOOKS | OF_MATPLOTLIB
     assert not offences(MODULES, lambda path: touched(path.read_text(), own))
     assert not offences(OTHERS, lambda path: touched(path.read_text(), others))
 
 
 def made_findable(source: str) -> bool:
-    """Whether a source changes where modules are looked for."""
+    """Return whether a source changes the module search path."""
     return bool(re.search(r"sys\.path\b|from sys import .*\bpath\b|\baddsitedir\b", source))
 
 
 def imported_tests(source: str) -> list[str]:
-    """Tests that a source imports, or takes something from."""
+    """Return test modules that a source imports, or imports from."""
     found = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -205,15 +205,15 @@ def imported_tests(source: str) -> list[str]:
     return [each for each in found if re.search(r"(^|\.)(tests|test_\w+|conftest)(\.|$)", each)]
 
 
-def test_scripts_stand_on_packages():
-    """None makes others findable but the pages' own, and no test is taken from another."""
+def test_scripts_import_installed_packages_only():
+    """Only scripts of the documentation change the search path; no test imports another."""
     may = ("conf.py", "test_docs.py", "test_architecture.py")
     assert not [p for p in OTHERS if p.name not in may and made_findable(p.read_text())]
     assert not offences(OTHERS, lambda path: imported_tests(path.read_text()))
 
 
 def anything(source: str) -> list[str]:
-    """Arguments and attributes, of what the package has classes for, that may be anything."""
+    """Return arguments and attributes annotated as Any although the package has a class."""
     found = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.arg):
@@ -230,8 +230,8 @@ def anything(source: str) -> list[str]:
     return found
 
 
-def test_nothing_may_be_anything_that_is_known():
-    """Of what the package has classes for none is passed on, or kept, as `Any`."""
+def test_known_classes_are_not_annotated_as_any():
+    """No argument or attribute for which the package has a class is annotated as `Any`."""
     assert not offences(MODULES, lambda path: anything(path.read_text()))
 
 
@@ -268,13 +268,13 @@ BROKEN = {
 }
 
 
-def test_what_breaks_a_rule_is_seen():
-    """Each of these would be found in a module; what the rules allow is in all modules."""
+def test_violations_of_the_rules_are_detected():
+    """Every violation in ``BROKEN`` is detected."""
     assert not [how for how, found in BROKEN.items() if not found()]
 
 
-def test_what_releases_differ_in_is_asked_of_compat():
-    """Other modules, demos, benchmarks and verification go through it."""
+def test_names_that_depend_on_the_release_come_from_compat():
+    """Other modules, demos, benchmarks and verification use `compat` for these names."""
     folders = ("fenics_contact", "demos", "benchmarks", "verification")
     paths = {path for folder in folders for path in (PACKAGE.parent / folder).rglob("*.py")}
     past = [
@@ -289,7 +289,7 @@ def test_what_releases_differ_in_is_asked_of_compat():
 
 @cache
 def exported(path: Path) -> set[str]:
-    """What a module says others may import."""
+    """Return the names in ``__all__`` of a module."""
     for node in ast.parse(path.read_text()).body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
             return set(ast.literal_eval(node.value))
@@ -297,7 +297,7 @@ def exported(path: Path) -> set[str]:
 
 
 def not_exported(path: Path) -> list[str]:
-    """What a module takes of another that is not in its ``__all__``, and secrets in its own."""
+    """Return imported names that are not in ``__all__``, and private names in its own."""
     said = {name(p): exported(p) for p in MODULES}
     tree, modules, unsaid = ast.parse(path.read_text()), {}, []
     for node in ast.walk(tree):
@@ -317,13 +317,13 @@ def not_exported(path: Path) -> list[str]:
     return unsaid + [n for n in said[name(path)] if re.match("_[a-z]", n)]
 
 
-def test_what_others_import_is_in_all():
-    """Whether by its name, or as an attribute of the module; and what is there has no secrets."""
+def test_imported_names_are_in_all():
+    """Names imported, or accessed by module, are in ``__all__``, which has no private names."""
     assert not offences(MODULES, not_exported)
 
 
 def made_in_constructor(of: ast.ClassDef, known: dict[str, ast.ClassDef]) -> set[str]:
-    """Attributes that a class, or one of the package that it inherits from, has from the start."""
+    """Return attributes that a class or its bases in the package define on construction."""
     found = set()
     for part in of.body:
         if isinstance(part, ast.FunctionDef) and part.name == "__init__":
@@ -341,15 +341,15 @@ def made_in_constructor(of: ast.ClassDef, known: dict[str, ast.ClassDef]) -> set
 
 
 def set_on_self(function: ast.FunctionDef) -> Iterator[str]:
-    """Attributes that are assigned to, or declared."""
+    """Yield attributes of self that a function assigns or declares."""
     for node in ast.walk(function):
         if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
             if ast.unparse(node.value) == "self":
                 yield node.attr
 
 
-def test_attributes_are_made_in_the_constructor():
-    """Whoever reads it knows all that an object may have; no method makes more of it."""
+def test_attributes_are_defined_in_the_constructor():
+    """No method other than the constructor adds attributes to an object."""
     classes = [
         node
         for path in MODULES

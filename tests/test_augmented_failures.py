@@ -1,4 +1,4 @@
-"""Augmented enforcement where it fails: nothing is changed, and the reason is told."""
+"""Failures of augmented enforcement change nothing, and the error states the reason."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ COMM = MPI.COMM_WORLD
 E = 1000.0
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
-# k h/E: springs no stiffer than a few layers of cells.
+# k h/E: springs as stiff as a few layers of cells.
 SOFT = fc.RelativeStiffness(10.0)
 AUGMENTED = {"enforcement": "augmented"}
 
 
 @pytest.mark.parametrize("what", ["iterations", "rounds"])
 def test_failure_leaves_no_trace(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Too few iterations or rounds: `NotConverged`; u, history and multipliers bit for bit."""
+    """Too few iterations or augmentations leave u, history and multipliers bitwise unchanged."""
     scene = block("quadrilateral", 1, n=4, up=-10.0)
     problem, contact = scene.problem(
         fc.Coulomb(0.3, k_n=1e4, k_t=1e4), [], contact={"obstacle": bulge(scene)} | AUGMENTED
@@ -41,7 +41,7 @@ def test_failure_leaves_no_trace(what: str, monkeypatch: pytest.MonkeyPatch) -> 
     else:
         problem.snes.setTolerances(max_it=0)
         problem.solver.main.max_it = 0
-        problem.solver.predictor.predict = False  # that guess can be the solution
+        problem.solver.predictor.predict = False  # the predicted state can be the solution
     scene.load(up=-30.0, side=5.0)
     words = (
         ("augmented Lagrangian method has not converged",) if what == "rounds" else ("increment 2",)
@@ -63,27 +63,27 @@ BAD = {
 
 @pytest.mark.whole
 @pytest.mark.parametrize("case", BAD)
-def test_bad_arguments(case: str) -> None:
-    """Refused by `Contact`, on all ranks, by name."""
+def test_invalid_arguments_are_refused(case: str) -> None:
+    """`Contact` refuses invalid arguments on all ranks, and names them."""
     options, law, words = BAD[case]
     scene = block("quadrilateral", 1, surface={"quadrature_scheme": "vertex"})
     call = lambda: scene.contact(law, **(AUGMENTED | options))  # noqa: E731
     raised_everywhere(call, ValueError, "contact", *words)
 
 
-def test_no_multipliers_under_penalty() -> None:
-    """The penalty has none to update."""
+def test_penalty_has_no_multipliers() -> None:
+    """`augment` is refused for the penalty, which has no multipliers."""
     scene = block("quadrilateral", 1)
     contact = scene.contact(fc.Frictionless(k_n=1e3))
     raised_everywhere(contact.augment, ValueError, "augmented")
     assert contact.multipliers is None
 
 
-def test_a_contact_that_only_the_first_round_touches() -> None:
-    """A ledge that the top reaches while the springs below still give, and then no more.
+def test_contact_closed_only_before_the_first_augmentation() -> None:
+    """The top reaches a ledge while the springs of the floor are compressed, and later leaves it.
 
-    Reference: the load of 1, all of it on the floor, to the solver's tolerance of 1e-9; the block
-    gives way by 0.91e-3, the first springs by 1e-2, and the ledge is 5e-3 away.
+    Reference: the load of 1, all of it on the floor, to 1e-8 (the solver's tolerance is 1e-9). The
+    block shortens by 0.91e-3, the springs by 1e-2 at first, and the gap to the ledge is 5e-3.
     """
     scene = block("quadrilateral", up=-1.0)
     floor = scene.contact(fc.Frictionless(100.0), name="floor", **AUGMENTED)
@@ -102,7 +102,7 @@ def test_a_contact_that_only_the_first_round_touches() -> None:
     ledge.enforcement_error = noted
     problem = fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=[floor, ledge])
     step = problem.solve()
-    assert errors[0] > 0.0  # it did touch
+    assert errors[0] > 0.0  # the ledge was in contact
     assert step.contacts["floor"].normal_force == pytest.approx(1.0, rel=1e-8)
     assert step.contacts["ledge"].normal_force == 0.0
     assert step.verdict.enforcement["ledge"] == 0.0 and not step.verdict.failures
@@ -110,11 +110,12 @@ def test_a_contact_that_only_the_first_round_touches() -> None:
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("method", ["newton", "lbfgs"])
-def test_a_node_held_inside_of_the_obstacle_is_refused(kinematics, method):
-    """A side of a block whose lower node a condition moves into a wall: nothing undoes that.
+def test_dirichlet_node_inside_the_obstacle_is_refused(kinematics, method):
+    """A Dirichlet condition that moves a node of Γc into a wall is refused with multipliers.
 
-    Multipliers grew there from round to round, until what the springs bore was small beside them:
-    a pressure of 1e15 and more passed. Moved away from the wall, or by springs alone, it is solved.
+    The penetration cannot be removed: once the multipliers grew until the penalty part was small
+    relative to them, and pressures of 1e15 were accepted. If the node moves away from the wall, or
+    with the penalty, the problem is solved.
     """
     found = []
     for enforcement, way in (("augmented", 0.02), ("augmented", -0.02), ("penalty", 0.02)):

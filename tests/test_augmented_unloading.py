@@ -1,4 +1,4 @@
-"""Multipliers of a load that falls to a small share of what it was."""
+"""Multipliers when the load decreases to a small fraction."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
     ("friction", "share"), [(0.0, 1e-1), (0.0, 1e-6), (0.5, 1e-3), (0.5, 1e-6)]
 )
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
-def test_a_load_that_falls_takes_at_most_twice_what_it_took_to_rise(cell, friction, share):
-    """One increment, and no more than twice the iterations that the whole load takes from nothing.
+def test_unloading_takes_at_most_twice_the_iterations_of_loading(cell, friction, share):
+    """Unloading in one increment takes at most twice the iterations of loading from zero.
 
-    With multipliers of the load before it takes up to a hundred times that, or is refused. The
-    force is the load, by statics; without friction the way is forgotten, and u is what the small
-    load alone makes, to what the tolerance of 1e-5 leaves.
+    Starting from the multipliers of the previous load it takes up to a hundred times as many, or
+    fails. The force equals the load to 1e-8. Without friction u is that of the small load alone, to
+    1e-4 for the tolerance of 1e-5.
     """
     law = fc.Coulomb(friction) if friction else fc.Frictionless()
 
@@ -45,12 +45,11 @@ def test_a_load_that_falls_takes_at_most_twice_what_it_took_to_rise(cell, fricti
         assert close(u, found(10.0 * share)[1], 1e-4)
 
 
-def test_the_load_of_another_body_stays():
-    """Multipliers begin smaller where the load has fallen, whatever a body beside bears.
+def test_unloading_of_one_body_with_constant_load_on_another():
+    """Initial multipliers are reduced where the load has decreased, whatever the other load.
 
-    Two boxes on two floors, one pressed by 1000 all the time, the other by 10, then by 1e-5. By
-    statics the floors bear just that; the second increment takes no more than twice the iterations
-    of the first.
+    Two boxes on two floors are loaded by a constant 1000, and by 10, then 1e-5. Contact forces
+    equal the loads to 1e-8; the second increment takes at most twice the iterations of the first.
     """
     sides = {
         HEAVY: lambda x, c: (np.abs(x[:, 1]) < 1e-9) & (c[:, 0] < 1.5),

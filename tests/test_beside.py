@@ -1,6 +1,6 @@
-"""Unrelated bodies in the same mesh change no outcome: a scene that is refused is, and one holds.
+"""Unrelated bodies in the same mesh change neither refusals nor solutions.
 
-Reference of every case is the same scene alone, refused with the same words or right by its forces.
+The reference of every case is the same scene alone: the same error message, or the same forces.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FLOOR = fc.HalfSpace((0, 0), (0, 1))
 
 
 class Play:
-    """A scene, the values that its increments set, and what is looked at."""
+    """A scene, its load increments, and the results that are compared."""
 
     def __init__(
         self,
@@ -36,13 +36,13 @@ class Play:
         measured: Sequence[ufl.Form] = (),
         **more: Any,
     ) -> None:
-        """Make the problem. Collective."""
+        """Create the problem. Collective."""
         self.scene, self.increments, self.contacts = scene, increments, contacts
         self.measured = [compiled(form) for form in measured]
         self.problem = scene.problem(*contacts, **more)
 
     def run(self) -> list[Array]:
-        """Solve all increments: resultants of the contacts of the scene, and what is measured."""
+        """Solve all increments and return the contact forces and the measured integrals."""
         for number, setting in enumerate(self.increments, 1):
             setting()
             self.scene.keep_busy(number / len(self.increments))
@@ -53,7 +53,7 @@ class Play:
 
 
 def setting(constant, *values) -> list[Callable[[], None]]:
-    """Increments that set a constant to one value after another."""
+    """Return increments that set a constant to the values in turn."""
 
     def to(value):
         constant.value = value
@@ -61,11 +61,11 @@ def setting(constant, *values) -> list[Callable[[], None]]:
     return [lambda value=value: to(value) for value in values]
 
 
-# ---- scenes that are refused ---------------------------------------------------------------------
+# ---- refused scenes ------------------------------------------------------------------------------
 
 
 def pops_out(busy):
-    """A wedge between two walls, let go in one increment: out of them, with energy from nowhere."""
+    """A wedge between two walls, unloaded in one increment: it leaves them and gains energy."""
 
     def lean(x):
         return np.column_stack([x[:, 0] * (1 + 0.2 * x[:, 1]), x[:, 1]])
@@ -85,7 +85,7 @@ def pops_out(busy):
 
 
 def too_soft(busy):
-    """A block that its load presses to a fraction of nothing, and widens by many times its size."""
+    """A block so soft that its load deforms it by many times its size."""
     scene = Beside({"block": Box(n=(4, 4))}, busy, E=0.02)
     press = scene.bodies.constant()
     scene.load("block", TOP, 1, press)
@@ -95,7 +95,7 @@ def too_soft(busy):
 
 
 def slides_far(busy):
-    """A block on a ball, moved aside by half of its size: gap and normals are others there."""
+    """A block on a ball, moved sideways by half of its size, which changes gap and normals."""
     scene = Beside({"block": Box(n=(6, 4))}, busy)
     aside = scene.bodies.constant()
     scene.hold("block", TOP, 1, value=-0.02)
@@ -106,7 +106,7 @@ def slides_far(busy):
 
 
 def held_inside(busy):
-    """Multipliers of a node that a condition holds inside of its obstacle."""
+    """Multipliers at a node that a Dirichlet condition prescribes inside of the obstacle."""
     scene = Beside({"block": Box()}, busy)
     depth = scene.bodies.constant()
     scene.hold("block", LEFT, 0, 1, value=depth)
@@ -117,7 +117,7 @@ def held_inside(busy):
 
 
 def not_held(busy):
-    """A block on a frictionless floor."""
+    """A block on a frictionless floor, free to translate."""
     scene = Beside({"block": Box()}, busy)
     scene.load("block", TOP, 1, scene.bodies.constant(-1e-3))
     contact = scene.contact("block", BOTTOM, FLOOR, fc.Frictionless(), name="floor")
@@ -133,22 +133,22 @@ def _pushed(busy, side, up):
 
 
 def pulled_off(busy):
-    """A block that its load lifts off its floor."""
+    """A block that its load lifts off the floor."""
     return _pushed(busy, 0.0, 1e-3)
 
 
 def pushed_aside(busy):
-    """A block pushed along its floor by more than friction bears."""
+    """A block whose tangential load exceeds the friction limit."""
     return _pushed(busy, 4e-4, -1e-3)
 
 
 def without_number(busy):
-    """A load that is none."""
+    """A block whose load is NaN."""
     return _pushed(busy, 0.0, np.nan)
 
 
 def out_of_range(busy):
-    """Friction that is none."""
+    """A block with a negative coefficient of friction."""
     scene = Beside({"block": Box()}, busy)
     scene.hold("block", TOP, 0, 1, value=-1e-3)
     friction = scene.bodies.constant(-0.3)
@@ -157,7 +157,7 @@ def out_of_range(busy):
 
 
 def half_as_steep(busy):
-    """A distance that changes by 2 per length."""
+    """A signed distance with a gradient of length 2."""
     scene = Beside({"block": Box()}, busy)
     scene.hold("block", TOP, 0, 1, value=-1e-3)
     floor = fc.SignedDistance(lambda x: 2 * x[1])
@@ -166,7 +166,7 @@ def half_as_steep(busy):
 
 
 def through_a_plate(busy):
-    """A block moved through a plate of a fiftieth of its size, in one increment."""
+    """A block moved in one increment through a plate as thick as a fiftieth of its size."""
     scene = Beside({"block": Box()}, busy)
     down = scene.bodies.constant()
     scene.hold("block", TOP, 0, 1, value=down)
@@ -176,7 +176,7 @@ def through_a_plate(busy):
 
 
 def beyond_its_limit(busy):
-    """A block pushed along its floor by more than a given limit of friction."""
+    """A block whose tangential load exceeds a prescribed friction limit."""
     scene = Beside({"block": Box()}, busy)
     scene.load("block", TOP, 1, scene.bodies.constant(-1e-3))
     scene.load("block", TOP, 0, scene.bodies.constant(4e-4))
@@ -203,13 +203,13 @@ REFUSED = {
 @pytest.mark.each
 @pytest.mark.parametrize("busy", [None, *BUSY])
 @pytest.mark.parametrize("scene", REFUSED, ids=lambda scene: scene.__name__)
-def test_what_is_refused_alone_is_refused_beside_others(scene, busy):
-    """With the same words; they passed beside a body that was compressed, moved or far away."""
+def test_refusals_do_not_depend_on_unrelated_bodies(scene, busy):
+    """The error is the same; next to compressed, moved or distant bodies there was none."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         if scene is pops_out and busy == "far away":
-            # The start that pops out is no equilibrium there, by round-off: friction holds it, with
-            # the force that eight increments lead to.
+            # Round-off of the distant body changes the start: friction keeps the wedge in place
+            # with the forces that eight increments yield.
             upright, leaning = scene([BUSY[busy]]).run()
             assert close(upright, np.array([7.21, -0.91]), 0.01) and close(leaning, -upright, 1e-6)
             return
@@ -220,8 +220,8 @@ def test_what_is_refused_alone_is_refused_beside_others(scene, busy):
         )
 
 
-def test_a_wall_far_away_is_no_excuse():
-    """Of the same body: it is 1000 away, and the block is deformed by many times its size."""
+def test_distant_wall_does_not_raise_the_deformation_limit():
+    """A wall 1000 away does not permit deformation of the same block by many times its size."""
     scene = too_soft([]).scene
     floor = scene.contact("block", BOTTOM, FLOOR, fc.Frictionless(), name="floor")
     wall = fc.HalfSpace((1001.0, 0), (-1, 0))
@@ -231,11 +231,11 @@ def test_a_wall_far_away_is_no_excuse():
     raised_everywhere(play.run, fc.NotConverged, "times its size")
 
 
-# ---- scenes that hold ----------------------------------------------------------------------------
+# ---- solved scenes -------------------------------------------------------------------------------
 
 
 def stacked(busy):
-    """Three blocks of rubber with gaps between them, the highest moved down."""
+    """Three rubber blocks with gaps between them, the uppermost moved down."""
     scene = Beside(
         {
             "lowest": Box((0, 0), (1, 0.3), (8, 2)),
@@ -258,7 +258,7 @@ def stacked(busy):
 
 
 def _on_a_spring(stiffness):
-    """A block on a floor, held along it by a spring alone that its load stretches by 1e-2."""
+    """A block on a floor, constrained along it by a spring that the load stretches by 1e-2."""
 
     def on_a_spring(busy):
         scene = Beside({"block": Box(n=(4, 4))}, busy)
@@ -273,12 +273,12 @@ def _on_a_spring(stiffness):
 
 
 def rubbed(busy):
-    """A block pressed and pushed along its floor, by less than friction bears."""
+    """A block whose tangential load is below the friction limit."""
     return _pushed(busy, 2e-4, -1e-3)
 
 
 def pressed_again(busy):
-    """A block on a floor with friction that is pressed, let go, and pressed and pushed again."""
+    """A block on a floor with friction, pressed, unloaded, and loaded again with shear."""
     scene = Beside({"block": Box()}, busy)
     press, push = scene.bodies.constant(), scene.bodies.constant()
     scene.load("block", TOP, 1, press)
@@ -293,7 +293,7 @@ def pressed_again(busy):
 
 
 def pressed_by_its_floor(busy):
-    """A held block on which a floor is pressed by a force, and led aside: at its friction limit."""
+    """A floor pressed by a force on a clamped block and moved sideways, at the friction limit."""
     scene = Beside({"block": Box()}, busy)
     scene.hold("block", TOP, 0, 1)
     push, aside = scene.bodies.constant(1e-2), scene.bodies.constant(2e-2)
@@ -318,8 +318,8 @@ _ALONE: dict[str, list[Array]] = {}
 @pytest.mark.each
 @pytest.mark.parametrize("busy", BUSY)
 @pytest.mark.parametrize("scene", HOLD)
-def test_what_holds_alone_holds_beside_others(scene, busy):
-    """With the same forces, to 1e-6; stacked blocks were thrown out, and springs were not seen."""
+def test_solutions_do_not_depend_on_unrelated_bodies(scene, busy):
+    """Forces agree to 1e-6; stacked blocks were ejected, and weak springs were not detected."""
     if scene not in _ALONE:
         _ALONE[scene] = HOLD[scene]([]).run()
     for found, alone in zip(HOLD[scene]([BUSY[busy]]).run(), _ALONE[scene], strict=True):
@@ -327,13 +327,13 @@ def test_what_holds_alone_holds_beside_others(scene, busy):
 
 
 def _on_multipliers(names: Sequence[str]) -> Array:
-    """Blocks under one contact with multipliers on soft springs, loaded by 10 and 1e-5, E = 1000.
+    """Solve blocks in one contact with multipliers and low k_n, loaded by 10 and 1e-5, E = 1000.
 
-    The first does not slide, the second is sheared by a fifth of its load.
+    The first does not slide, the second has a shear load of a fifth of its normal load.
 
     Returns:
-        Largest pressure under the second, and the largest penetration there by what its load would
-        make of the springs.
+        Largest pressure under the second block relative to its load, and its largest penetration
+        relative to load / k_n.
     """
     boxes = {"heavy": Box(n=(4, 4)), "light": Box((3.0, 0.0), n=(8, 4))}
     scene = Beside({name: boxes[name] for name in names}, E=1e3)
@@ -353,18 +353,18 @@ def _on_multipliers(names: Sequence[str]) -> Array:
     return np.max(COMM.allgather(largest), axis=0)
 
 
-def test_multipliers_of_a_light_body_beside_a_heavy_one():
-    """One contact on both, loads a million times apart: as exact as alone, to 1e-6.
+def test_multipliers_of_light_and_heavy_body_in_one_contact():
+    """In one contact with loads in the ratio 1e6 the light body is as exact as alone, to 1e-6.
 
-    Rounds of multipliers, which need not be equally many, end at 1e-8. The largest pressure was
-    1.6 % off, because what the springs bore was small by the other's.
+    Augmentations, whose number may differ, end at 1e-8. The largest pressure had an error of
+    1.6 %, because the penalty part was compared with the tractions of the heavy body.
     """
     assert close(_on_multipliers(["heavy", "light"]), _on_multipliers(["light"]), 1e-6)
 
 
 @pytest.mark.parametrize("method", ["newton", "continuation"])
-def test_a_body_that_is_led_aside_after_a_restart_of_the_solver(method):
-    """Its forces are the round-off of its displacement alone, which is allowed for as before."""
+def test_displaced_unrelated_body_after_solver_restart(method):
+    """Residuals of the displaced body are round-off of its displacement and are accepted."""
     scene = Beside({"block": Box()}, [BUSY["led aside"]], E=1e3)
     press = scene.bodies.constant()
     scene.load("block", TOP, 1, press)
@@ -381,10 +381,11 @@ def test_a_body_that_is_led_aside_after_a_restart_of_the_solver(method):
     assert close(play.run()[0][1], 0.3, 1e-9)
 
 
-def test_a_light_load_beside_a_stiff_body():
-    """1e-9 of E, beside forces 1e13 times as large that do not grow with it: 1e-6 of its force.
+def test_light_load_with_unrelated_stiff_body():
+    """A load of 1e-9 E with constant forces 1e13 times larger elsewhere is exact to 1e-6.
 
-    A load is a combination of earlier ones if it is on every body, and not on the stiffest alone.
+    A load is a linear combination of earlier ones only if it is on every body, not just the
+    stiffest.
     """
     scene = Beside({"block": Box(n=(4, 4))}, [BUSY["stiff"]])
     press = scene.bodies.constant()
@@ -395,14 +396,14 @@ def test_a_light_load_beside_a_stiff_body():
     assert close(play.run()[0][1] / 4e-9, 1.0, 1e-6)
 
 
-# ---- one contact on several bodies ---------------------------------------------------------------
+# ---- one contact with several bodies -------------------------------------------------------------
 
 
 @pytest.mark.parametrize("stiff", [None, 1.0, 1e4])
-def test_a_body_led_aside_is_refused_whatever_else_its_contact_has(stiff):
-    """Half of a block's width on a ball: alone refused, and with another block of the same contact.
+def test_large_displacement_is_refused_for_each_body_of_a_contact(stiff):
+    """A block moved on a ball by half of its width is refused, alone or with another block.
 
-    With finite kinematics the block bears 0.0058, by small displacements 0.029.
+    The force is 0.0058 with finite kinematics, 0.029 with small displacements.
     """
     boxes = {"aside": Box((0.0, 0.0), (1.0, 1.0), (6, 4))}
     if stiff is not None:
@@ -423,10 +424,11 @@ def test_a_body_led_aside_is_refused_whatever_else_its_contact_has(stiff):
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_bodies_of_one_contact_slip_from_their_own_first_touch(kinematics):
-    """Two blocks over a floor, 0.001 and 0.1 above it, are led down and aside in one increment.
+def test_slip_reference_of_each_body_is_its_own_first_touch(kinematics):
+    """Two blocks, 0.001 and 0.1 above a floor, move down and sideways in one increment.
 
-    Reference: the second alone. Counted from where the first one touches, 4.3 times its friction.
+    Reference: the second alone, to 1e-8. With slip from the first touch of the other block its
+    friction force was 4.3 times as large.
     """
     found = []
     for names in (("high",), ("low", "high")):
@@ -442,13 +444,13 @@ def test_bodies_of_one_contact_slip_from_their_own_first_touch(kinematics):
         mine = contact.points[:, 0] > 2.0
         force = contact.measure[mine] @ contact.traction[mine]
         found.append(np.sum(COMM.allgather(force), axis=0))
-    assert abs(found[0][0]) < 0.45 * found[0][1]  # else all of it slips, from wherever it counts
+    assert abs(found[0][0]) < 0.45 * found[0][1]  # else all slip with any reference
     assert close(found[1], found[0], 1e-8)
 
 
 @pytest.mark.parametrize("beside", [False, True])
-def test_nothing_is_wrong_where_no_load_is_left(beside):
-    """Loaded, unloaded to zero twice, and loaded again: energies are round-off in between."""
+def test_unloading_to_zero_and_reloading(beside):
+    """Energies are round-off after unloading; forces are 1, 0, 0 and 1, to 1e-9."""
     boxes = {"block": Box(n=(4, 4))} | ({"other": Box((3.0, 0.0))} if beside else {})
     scene = Beside(boxes, E=1.0)
     load = scene.bodies.constant(0.0)
@@ -471,11 +473,11 @@ def test_nothing_is_wrong_where_no_load_is_left(beside):
     assert np.allclose(borne, [1.0, 0.0, 0.0, 1.0], rtol=0.0, atol=1e-9)
 
 
-def test_a_prescribed_gap_ends_where_the_other_surface_does():
-    """A block on a slab, gap 0 given, is pushed off its end: in one increment as in twenty.
+def test_prescribed_gap_ends_at_the_edge_of_the_opposing_surface():
+    """A block with the gap 0 is pushed off the end of a slab, in 1 or 20 increments.
 
-    It bore 246 wherever it was. The force is that of finite kinematics without a gap given, 1 %
-    for displacements of 2e-3 of the size; once it is off it is none.
+    The force was 246 at all positions. Reference: finite kinematics without a prescribed gap, to
+    1 % for displacements of 2e-3 of the size; beyond the end the force is zero.
     """
     boxes = {
         "slab": Box((0.0, 0.0), (3.0, 0.5), (12, 2)),

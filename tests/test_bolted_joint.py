@@ -1,4 +1,4 @@
-"""Three bodies and three contacts, one of the bodies held by friction alone."""
+"""Three bodies and three contacts; one of the bodies is constrained by friction alone."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from scenes.comparing import raised_everywhere
 pytestmark = pytest.mark.two_ranks
 
 
-def test_tightened_and_pulled_until_it_slips() -> None:
-    """The bolt and the upper plate are in equilibrium, friction bears what it can, and no more.
+def test_tightened_joint_is_pulled_to_the_friction_limit() -> None:
+    """Bolt and upper plate are in equilibrium up to the friction limit, above which it is stated.
 
-    The references are statics: what pulls is borne by plates and bolt, and what the bolt takes at
-    its head it gives at its nut, to 1e-3 of the clamping force (the preset solves to 1e-4 of each
-    body's forces). Linear elements, on which the clamping force itself depends, serve for that.
+    The references are statics: the pull is carried by plates and bolt, and the forces on head and
+    nut of the bolt cancel, to 1e-3 of the clamping force (the preset solves to 1e-4 of each body's
+    forces). Linear elements, on which the clamping force itself depends, are sufficient for this.
     """
     made = BoltedJoint(5.0, degree=1)
     for _ in made.increments(3.5, steps=7):
@@ -28,7 +28,7 @@ def test_tightened_and_pulled_until_it_slips() -> None:
         assert abs(borne - float(made.pull.value)) < 1e-3 * clamped
         for found in r.values():
             assert found.tangential_force <= FRICTION * found.normal_force * (1 + 1e-9)
-    # The plates slip as a whole by now; what is more goes through the bolt.
+    # All points of the plates slip now; the bolt carries the rest.
     assert r["plates"].stick == 0
     assert r["plates"].force[0] == pytest.approx(FRICTION * r["plates"].normal_force, rel=1e-3)
     limit = FRICTION * (r["plates"].normal_force + clamped)
@@ -45,20 +45,21 @@ def test_tightened_and_pulled_until_it_slips() -> None:
             raise
 
     raised_everywhere(solve, fc.NotConverged, words)
-    # In the first round of multipliers the last method tells of it, in 10 iterations; in the second
-    # it is asked alone, in 11. How many rounds of 20 iterations L-BFGS makes before is decided by
-    # round-off.
+    # In the first augmentation the last method detects the overload, in 10 iterations; in the
+    # second it is the only one, with 11. How many times L-BFGS makes 20 iterations before depends
+    # on round-off.
     tried = failed[0].attempts
     every = ["lbfgs", "primal_dual", "continuation", "alternating", "alternating"]
     assert [each.method for each in tried] == every
     assert all(each.iterations < 20 for each in tried[3:])
 
 
-def test_tightened_where_all_points_of_a_joint_slip() -> None:
-    """Quadratic elements, whose deformed faces call for the estimate of what that changes.
+def test_joint_is_tightened_if_all_points_of_head_and_nut_slip() -> None:
+    """With quadratic elements the small-displacement error of the deformed faces is estimated.
 
-    All points below head and nut slip: what turns with their slip alone holds the bolt. It was
-    refused, as loose. References: statics, as above; what is said to change, 1 % at most.
+    All points below head and nut slip: only the change of the friction's direction with the slip
+    constrains the bolt. It was refused, as unconstrained. References: statics, as above; the
+    small-displacement error, at most 1 %.
     """
     made = BoltedJoint(5.0, degree=2)
     for load in (0.5, 1.0):
@@ -66,7 +67,7 @@ def test_tightened_where_all_points_of_a_joint_slip() -> None:
         step = made.problem.solve()
         made.problem.commit()
         assert all(step.contacts[name].stick == 0 for name in ("head", "nut"))
-        assert step.attempts[0].method == "lbfgs"  # the default though contact holds the bolt
+        assert step.attempts[0].method == "lbfgs"  # default, although the bolt is free
         assert max(each.worst for each in step.verdict.small_displacement_error.values()) < 0.01
         forces = [contact.resultants().normal_force for contact in made.contacts]
         assert forces == pytest.approx([forces[1]] * 3, rel=1e-3)

@@ -1,8 +1,9 @@
-"""Among several equilibria with friction: the one that smaller increments lead to.
+"""Of several equilibria with friction the solution is the one that smaller increments lead to.
 
-A wedge of half-angle atan(0.2) between walls with μ = 0.5 is self-locking: pressed in and let go it
-stays, and the walls still press on it. In one increment its equations have another solution, too:
-out of the walls, without any force. The reference is the same history in eight increments.
+A wedge of half-angle atan(0.2) between walls with μ = 0.5 is self-locking: pressed in and released
+it stays, and the walls still exert forces on it. In one increment the equations have another
+solution, too: outside of the walls, without forces. The reference is the same history in eight
+increments.
 """
 
 import warnings
@@ -22,7 +23,7 @@ pytestmark = pytest.mark.two_ranks
 
 
 def wedge(**options):
-    """Wedge between an upright wall and one that leans, held by friction alone."""
+    """Make a wedge between a vertical and an inclined wall, constrained by friction alone."""
     scene = block("quadrilateral", n=6)
     x = scene.mesh.geometry.x
     x[:, 0] *= 1 + 0.2 * x[:, 1]
@@ -46,7 +47,7 @@ def wedge(**options):
 
 
 def released(steps, **options):
-    """Pressed in by one increment and let go in a number of them: normal forces at the end."""
+    """Press the wedge in and release it in ``steps`` increments; return normal forces and steps."""
     scene, problem, contacts = wedge(**options)
 
     def load(share):
@@ -60,8 +61,8 @@ def released(steps, **options):
 
 
 @pytest.mark.parametrize("method", [None, "newton", "continuation"])
-def test_a_locked_wedge_stays(method):
-    """Let go in one increment that is cut where it pops out: the force of eight, within 2 %."""
+def test_locked_wedge_keeps_its_forces(method):
+    """Released in one increment, cut when it is ejected, it has the forces of eight, within 2 %."""
     expected, steps = released(8)
     assert len(steps) == 8 and np.all(expected > 5.0)
     found, _ = released(1, method=method)
@@ -71,11 +72,12 @@ def test_a_locked_wedge_stays(method):
 @pytest.mark.each
 @pytest.mark.parametrize("method", [None, "newton", "lbfgs"])
 @pytest.mark.parametrize("pull", [0.01, 0.2])
-def test_a_locked_wedge_is_not_taken_for_a_released_one(pull, method):
-    """Let go, contact forces cancel, and a pull starts from where the wedge is, not from rest.
+def test_locked_wedge_without_load_is_not_taken_for_unloaded(pull, method):
+    """Without load contact forces cancel, and a pull starts at the position of the locked wedge.
 
-    It is far less than what frees it: one increment has the force of eight, within 2 %. Not by
-    continuation alone, which begins with soft contact, that locks nothing, and is refused here.
+    The pull is far below what frees the wedge: one increment has the forces of eight, within 2 %.
+    Continuation alone is excluded: it begins with soft contact, which locks nothing, and is
+    refused.
     """
     forces = []
     for steps in (1, 8):
@@ -89,14 +91,14 @@ def test_a_locked_wedge_is_not_taken_for_a_released_one(pull, method):
             list(fc.increments(problem, load, 0.0, 1.0))
             list(fc.increments(problem, load, 1.0, 0.0, steps=8))
             pulled = list(fc.increments(problem, load, 0.0, -pull, steps=steps))
-        assert len(pulled) == steps  # none was cut
+        assert len(pulled) == steps  # no increment was cut
         forces.append([c.resultants().normal_force for c in contacts])
     assert min(forces[1]) > 5.0
     assert close(np.array(forces[0]), np.array(forces[1]), 0.02)
 
 
-def test_popping_out_is_no_solution():
-    """Without increments to cut it is refused, with the reason, and u and history stay."""
+def test_ejected_wedge_is_refused():
+    """Without cuts the increment is refused with the reason, and the history is unchanged."""
     scene, problem, contacts = wedge(method="newton")
     scene.load(up=-PRESS)
     with warnings.catch_warnings():
@@ -111,10 +113,10 @@ def test_popping_out_is_no_solution():
         assert close(contact.history.rows(), rows, 0.0)
 
 
-def test_friction_takes_energy():
-    """It brakes in every increment of a cycle of pressing, letting go and pressing again.
+def test_friction_supplies_at_most_one_percent_of_the_energy():
+    """Friction dissipates in every increment of pressing, releasing and pressing again.
 
-    Where slip turns round within an increment the mean of the tractions does not see it: 1 %.
+    If slip is reversed within an increment the mean of the tractions misses this: 1 %.
     """
     scene, problem, _ = wedge()
     with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""Bulk forms, conditions and loads of many kinds, in contact, against closed solutions."""
+"""Bulk forms, Dirichlet conditions and loads with contact, against closed-form solutions."""
 
 import numpy as np
 import pytest
@@ -29,8 +29,8 @@ COMM = MPI.COMM_WORLD
 TIGHT = {"snes_rtol": 1e-13}
 
 
-def test_nothing_in_reach():
-    """An obstacle out of reach: the problem is linear elasticity, and the contact force is zero."""
+def test_distant_obstacle_has_no_contact_force():
+    """With a distant obstacle the problem is linear elasticity, and the contact force is zero."""
     scene = block("triangle", 2)
     push = fem.Constant(scene.mesh, -0.01)
     bcs = [*scene.rollers(), scene.hold(TOP, 1, push)]
@@ -39,15 +39,15 @@ def test_nothing_in_reach():
     step = problem.solve()
     r = step.contacts["contact"]
     assert r.normal_force == 0.0 and r.area == 0.0 and r.stick == r.slip == 0
-    # The block moves as a rigid body, up to the solver's 1e-9.
+    # The block moves as a rigid body, up to the solver's tolerance of 1e-9.
     assert same_field(scene.u, lambda x: np.vstack([0 * x[0], 0 * x[0] - 0.01]), 1e-8)
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_body_force(cell):
-    """A heavy block on the floor: N = weight, and σ = ρ g (1 - y) to the element of degree 2.
+    """A block under its weight has N = weight and σ = ρ g (1 - y), with elements of degree 2.
 
-    Reference: ν = 0, u_y = -ρg/k_n - ρg (y - y²/2)/E, which the element represents. 1e-9.
+    Reference: ν = 0, u_y = -ρg/k_n - ρg (y - y²/2)/E, which the element represents, to 1e-9.
     """
     weight, k_n = 3.0, 5e3
     scene = block(cell, 2, nu=0.0)
@@ -65,8 +65,8 @@ def test_body_force(cell):
     assert same_field(scene.u, exact, 1e-9)
 
 
-def test_condition_on_components():
-    """The top pushed down, free to slide: N = d / (H/E' + 1/k_n), E' = E/(1 - ν²). 1e-9."""
+def test_dirichlet_condition_on_one_component():
+    """A top pressed down by d has N = d / (H/E' + 1/k_n), E' = E/(1 - ν²), to 1e-9."""
     scene = block("quadrilateral", shuffled=True)
     push = fem.Constant(scene.mesh, -0.01)
     bcs = [*scene.rollers(), scene.hold(TOP, 1, push)]
@@ -81,10 +81,10 @@ def test_condition_on_components():
 @pytest.mark.each
 @pytest.mark.parametrize("kind", ["vector", "function", "component by function"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_conditions_of_every_kind(cell, kind):
-    """The top displaced as a whole by each of DOLFINx's conditions: N = d / (H/E + 1/k_n), ν = 0.
+def test_dirichlet_conditions_of_all_kinds(cell, kind):
+    """All kinds of DOLFINx's Dirichlet conditions on the top give N = d / (H/E + 1/k_n), ν = 0.
 
-    On several ranks too, where a condition holds dofs that are another rank's. 1e-9.
+    On several ranks a condition includes dofs owned by another rank. Tolerance 1e-9.
     """
     scene = block(cell, nu=0.0, n=3)
     space = scene.u.function_space
@@ -111,9 +111,9 @@ def test_conditions_of_every_kind(cell, kind):
 
 
 def test_plane_stress_with_thickness():
-    """Plane stress of a plate of thickness 0.2, by the form and ``weight``: σ_x = σ_z = 0.
+    """A plate of thickness 0.2, in the form and as ``weight``, is in plane stress, σ_x = σ_z = 0.
 
-    Reference: u_x = ν p x/E, u_y = -p y/E - p/k_n; N = p · 0.2. 1e-10, as in `test_patch`.
+    Reference: u_x = ν p x/E, u_y = -p y/E - p/k_n; N = p · 0.2, to 1e-10.
     """
     E, nu, p, k_n, thickness = 1000.0, 0.3, 2.0, 5e3, 0.2
     scene = block("triangle", up=-p, shuffled=True)
@@ -134,8 +134,8 @@ def test_plane_stress_with_thickness():
     assert same_field(
         scene.u, lambda x: np.vstack([nu * p / E * x[0], -p / E * x[1] - p / k_n]), 1e-10
     )
-    # E/h comes from the form, its thickness taken out: within the 10 % that the docstring of
-    # `cell_modulus` allows for plane stress; without the weight it would be a fifth.
+    # E/h is computed from the form, divided by the thickness: within the 10 % that the docstring of
+    # `cell_modulus` states for plane stress; without the weight it would be a fifth.
     law = fc.Frictionless(k_n=fc.RelativeStiffness(5.0))
     scene.problem(law, scene.rollers(), contact={"weight": t})
     _, scaled = scene.problem(law, scene.rollers(), contact={"weight": t})
@@ -148,10 +148,10 @@ def test_plane_stress_with_thickness():
 
 @pytest.mark.parametrize("degree", [1, 2])
 def test_axisymmetric(degree):
-    """A cylinder under axial pressure, weight 2πr: σ_z = -p alone; N = p π R².
+    """A cylinder under axial pressure, weight 2πr, has σ_z = -p as only stress, and N = p π R².
 
-    Reference: u_r = ν p r/E, u_z = -p z/E - p/k_n, linear. Tolerance 1e-9: the hoop strain u_r/r
-    is integrated as a quotient, exact here since it is constant; round-off near the axis.
+    Reference: u_r = ν p r/E, u_z = -p z/E - p/k_n, linear. Tolerance 1e-9, round-off near the
+    axis: the hoop strain u_r/r is constant, so that its quadrature is exact.
     """
     E, nu, p, k_n, radius = 1000.0, 0.3, 2.0, 5e3, 1.5
     scene = block("quadrilateral", degree, up=-p, size=(radius, 1.0), shuffled=True)
@@ -187,11 +187,12 @@ def test_axisymmetric(degree):
 
 
 @pytest.mark.parametrize("way", [(0.0, 0.0), (0.0, 1e3), (1e3, 0.0)])
-def test_a_mass_in_the_form_is_no_stiffness(way):
-    """As of inertia or a soft foundation, wherever the body is: 5 u of E = 1000, cells 1/4 high.
+def test_mass_term_does_not_change_the_relative_stiffness(way):
+    """A term 5 u, of inertia or a soft foundation, does not change k_n, wherever the body is.
 
-    Reference: k_n = 5 E/h by the elastic part; with the way from the origin in it E was 0.3, 16 and
-    35 % too large. 1e-9: round-off of coordinates 1e3 times as large as cells.
+    Reference: k_n = 5 E/h of the elastic part, E = 1000, h = 1/4. Once E depended on the distance
+    from the origin and was 0.3, 16 and 35 % too large. Tolerance 1e-9: round-off of coordinates
+    1e3 times as large as cells.
     """
     mesh, tags = block_mesh("quadrilateral", n=4)
     mesh.geometry.x[:, :2] += way
@@ -209,7 +210,7 @@ def test_a_mass_in_the_form_is_no_stiffness(way):
 
 @pytest.mark.parametrize("kind", ["function", "ufl"])
 def test_variable_modulus(kind):
-    """Layers of moduli 1000 and 4000: u piecewise linear; `RelativeStiffness` takes the lower E.
+    """Layers with E = 1000 and 4000 give a piecewise linear u; k_n is relative to the lower E.
 
     Reference: ν = 0, u_y(y) = -p/k_n - p ∫ dy/E; k_n = 5 · 1000 / (1/4). Tolerance 1e-9.
     """
@@ -243,10 +244,10 @@ def test_variable_modulus(kind):
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_nonlinear_bulk(cell, method):
-    """St Venant-Kirchhoff under a dead load of E/10: the stretch solves λ (λ² - 1) E/2 = -p.
+    """St Venant-Kirchhoff under a dead load of E/10 has a stretch with λ (λ² - 1) E/2 = -p.
 
-    ν = 0, so that the state is uniaxial; the penetration is p/k_n. Reference: the cubic's root by
-    numpy. Tolerance 1e-8: the solver's, 1e-11 of the forces, with room for the tangent's condition.
+    ν = 0, so that the state is uniaxial; the penetration is p/k_n. Reference: the root of the cubic
+    by numpy. Tolerance 1e-8: the solver's 1e-11 of the forces, times the condition of the tangent.
     """
     E, p, k_n = 1000.0, 100.0, 5e4
     scene = block(cell, up=-p)
@@ -276,10 +277,11 @@ def test_nonlinear_bulk(cell, method):
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
-def test_impossible_increment_of_a_nonlinear_body(method):
-    """A neo-Hookean block pushed through itself: NotConverged, not NaN; then it goes on.
+def test_failed_increment_of_nonlinear_bulk_is_recoverable(method):
+    """A neo-Hookean block compressed to negative height raises NotConverged and can be continued.
 
-    Reference for going on: an equal block that never failed; 1e-7 of the largest value.
+    Reference for the next increment: an equal block that never failed, to 1e-7 of the largest
+    value.
     """
     results = []
     for fails in (True, False):
@@ -311,12 +313,13 @@ def test_impossible_increment_of_a_nonlinear_body(method):
         assert close(a, b, 1e-7)
 
 
-def test_collapsed_cells_excuse_nothing_afterwards():
-    """Rubber pushed so far into a ball that its cells collapse; then on, as if nothing had been.
+def test_collapsed_cells_do_not_loosen_later_tolerances():
+    """After a failed increment with collapsed cells, rubber is solved as if it had not failed.
 
-    What round-off excuses is by the stiffness assembled last, and that of such cells is without
-    bounds: residuals of 1e-4 of the forces passed in the next increment. Reference: Newton's method
-    to 1e-12, without the failure; 1e-8 of the largest displacement, for 1e-9 of the forces.
+    The allowed round-off depends on the last assembled stiffness, which is unbounded for collapsed
+    cells: once residuals of 1e-4 of the forces were accepted in the next increment. Reference:
+    Newton's method to 1e-12, without the failure; to 1e-8 of the largest displacement, for 1e-9 of
+    the forces.
     """
     found = []
     for ways, options in (
@@ -337,11 +340,11 @@ def test_collapsed_cells_excuse_nothing_afterwards():
     assert close(*found, 1e-8)
 
 
-def test_a_corner_turned_inside_out_is_seen_by_any_rule_of_the_form():
-    """One bilinear cell, the unit square, whose corner moves by a (1, 1).
+def test_inverted_corner_is_detected_by_any_quadrature():
+    """The inversion of one bilinear cell at a corner that moves by a (1, 1) is detected.
 
-    det(I + grad u) = 1 + a (x + y) is 1 + 2a at that corner and larger at the points of any Gauss
-    rule. Reference: its sign, at 5 % of the size of the cell on either side of a = -1/2.
+    det(I + grad u) = 1 + a (x + y) is 1 + 2a at that corner and larger at all Gauss points.
+    Reference: its sign, for a = -1/2 with 5 % of the size of the cell on either side.
     """
     scene = rubber("quadrilateral", degree=1, n=(1, 1), size=[1.0, 1.0])
     problem, _ = scene.problem(fc.HalfSpace((0, 2.0), (0, -1.0)), fc.Frictionless(1e4))
@@ -351,10 +354,10 @@ def test_a_corner_turned_inside_out_is_seen_by_any_rule_of_the_form():
 
 
 def test_unsymmetric_bulk():
-    """A bulk whose tangent is not symmetric is seen as such and solved: equilibrium.
+    """A bulk with an unsymmetric tangent is recognised as unsymmetric, and solved.
 
-    An elastic bedding in the bulk, to the side by a share of the settlement. Reference: the
-    forces on the whole block sum to zero, 1e-8 of the load.
+    An elastic bedding in the bulk has a lateral force that also depends on the settlement.
+    Reference: the forces on the block sum to zero, to 1e-8 of the load.
     """
     scene = block("quadrilateral", up=-1.0)
     v = ufl.TestFunction(scene.u.function_space)
@@ -372,11 +375,11 @@ def test_unsymmetric_bulk():
     assert abs(bedding) > 1e-4
 
 
-def test_a_load_that_steps_with_the_displacement():
-    """A force that falls once the body gives way has no derivative, and is not linear all the same.
+def test_load_with_a_jump_in_the_displacement():
+    """A load that jumps with the displacement makes the bulk nonlinear, with zero derivative.
 
-    It is 3 until the top has sunk by 1e-4 and 2 from there on, which it has: 2e-3. Tolerance 1e-8:
-    the solver's, with room for the tangent's condition.
+    It is 3 until the top has sunk by 1e-4, and 2 afterwards; the solution has sunk by 2e-3.
+    Reference: N = 2, to 1e-8, the solver's tolerance times the condition of the tangent.
     """
     E, k_n = 1000.0, 5e4
     scene = block("quadrilateral", E=E, nu=0.0, n=2)

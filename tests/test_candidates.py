@@ -1,7 +1,7 @@
-"""Only what can touch: of a generous tag the unknowns that are kept when condensed.
+"""Candidate dofs: static condensation retains only the dofs that can come into contact.
 
-References are the same scene on all unknowns, or with a tight tag. All are solved to 1e-12 of the
-forces and agree to 1e-8 of the largest entry, increments one after another.
+Γc is tagged generously. References are the same scene on all dofs, or with a tight tag. All are
+solved to 1e-12 of the forces and agree to 1e-8 of the largest entry, in successive increments.
 """
 
 import logging
@@ -21,19 +21,19 @@ ON_ONE_RANK = pytest.mark.skipif(COMM.size > 1, reason="takes minutes there")
 
 SAME = 1e-8
 TIGHT = {"petsc_options": {"snes_rtol": 1e-12}}
-# What costs next to nothing; the top has a thousand and more.
+# Retained dofs of negligible cost; the top has more than a thousand.
 FEW = 500
 
 
 def kept(made):
-    """Number of the unknowns kept."""
+    """Return the number of retained dofs."""
     system = made.problem.solver.system
     assert made.problem.solver.condensed
     return system.unknowns.n_global
 
 
 def run(made, end=1.0, steps=2, **options):
-    """The steps to ``end``, and what they came to."""
+    """Run the increments to ``end``; return them and their results."""
     found = list(made.increments(end, steps=steps, **options))
     forces = np.array([step.contacts["contact"].force for step in found])
     counts = [[s.contacts["contact"].stick, s.contacts["contact"].slip] for s in found]
@@ -46,7 +46,7 @@ def assert_same(one, other, rtol=SAME):
 
 
 def n_grown(steps):
-    """How often contact went beyond what was kept."""
+    """Return how often contact has spread beyond the retained dofs."""
     return sum("spreads" in attempt.outcome for step in steps for attempt in step.attempts)
 
 
@@ -54,8 +54,8 @@ def n_grown(steps):
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_a_generous_tag(cell):
-    """The same as on all unknowns and with a tight tag; few are kept, and condensed once."""
+def test_generously_tagged_surface(cell):
+    """Results are those of all dofs and of a tight tag; few dofs are retained, condensed once."""
     made = Pressed(cell=cell, **TIGHT)
     steps, found = run(made)
     assert kept(made) <= FEW
@@ -63,7 +63,7 @@ def test_a_generous_tag(cell):
     assert n_grown(steps) == 0
     full = Pressed(cell=cell, condensation=False, **TIGHT)
     assert_same(found, run(full)[1])
-    # Where points are closed the ball has passed the top by a sixth of the tag at most.
+    # The closed points cover a sixth of the tag at most.
     assert_same(found, run(Pressed(cell=cell, within=0.5, **TIGHT))[1])
 
 
@@ -76,7 +76,7 @@ LAWS = {
 
 @pytest.mark.parametrize("law", LAWS)
 def test_laws(law):
-    """Of every kind, dragged a little."""
+    """Results agree for laws of every kind, with the ball dragged a little."""
     cell = "tetrahedron" if law == "polygon" else "quadrilateral"
     made = [Pressed(LAWS[law], cell=cell, condensation=c, **TIGHT) for c in (None, False)]
     (steps, found), (_, full) = (run(m, 1.2, 3) for m in made)
@@ -88,7 +88,7 @@ def test_laws(law):
 @pytest.mark.each
 @pytest.mark.parametrize("method", ["lbfgs", "newton", "alternating", "continuation"])
 def test_methods(method):
-    """By every method; L-BFGS ends at less digits, and all unknowns are solved as exactly."""
+    """Results agree for all methods; L-BFGS has fewer digits, with and without condensation."""
     made = [Pressed(condensation=c, method=method, **TIGHT) for c in (None, False)]
     (_, found), (_, full) = (run(m) for m in made)
     assert kept(made[0]) <= FEW
@@ -96,7 +96,7 @@ def test_methods(method):
 
 
 def test_multipliers():
-    """Rounds of multipliers: none acts where nothing touches; to the tolerance of the rounds."""
+    """Results agree with multipliers, which vanish at open points, to their tolerance."""
     tolerance = 1e-6
     options = {"cell": "tetrahedron", "contact": {"enforcement": "augmented"}} | TIGHT
     options["contact"]["tolerance"] = tolerance
@@ -108,8 +108,8 @@ def test_multipliers():
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_a_ball_driven_by_a_force(cell):
-    """Its motion is an unknown: points away from the contact would be closed by it unseen."""
+def test_ball_pushed_by_a_force(cell):
+    """The motion of the ball is unknown: it could close points away from the contact unseen."""
     made = [Pressed(cell=cell, force=20.0, condensation=c, **TIGHT) for c in (None, False)]
     (_, found), (_, full) = (run(m, 1.2, 3) for m in made)
     assert kept(made[0]) <= FEW + 1
@@ -117,8 +117,11 @@ def test_a_ball_driven_by_a_force(cell):
 
 
 @pytest.mark.parametrize("pressure", [5.0, 40.0])
-def test_a_body_that_contact_alone_holds(pressure):
-    """Pressed up against the ball; by the larger pressure contact grows beyond what is kept."""
+def test_body_constrained_by_contact_alone(pressure):
+    """A pressure pushes a block up against the ball: results agree.
+
+    With the larger pressure contact spreads beyond the retained dofs.
+    """
     made = [Pressed(pressure=pressure, condensation=c, **TIGHT) for c in (True, False)]
     (steps, found), (_, full) = (run(m, 1.0, 4) for m in made)
     assert n_grown(steps) >= 1 if pressure > 10 else kept(made[0]) <= FEW
@@ -127,7 +130,10 @@ def test_a_body_that_contact_alone_holds(pressure):
 
 @pytest.mark.parametrize("update", ["never", pytest.param("increment", marks=ON_ONE_RANK)])
 def test_two_bodies(update):
-    """A round shoe, a body of its own, pressed on and dragged; pairs as they were or found anew."""
+    """A round shoe, a body of its own, is pressed on the block and dragged: results agree.
+
+    The pairs are those of the undeformed bodies, or updated.
+    """
     end, steps = (1.0, 2) if update == "never" else (1.5, 6)
     made = [Shod(update_pairs=update, condensation=c, **TIGHT) for c in (None, False)]
     (_, found), (_, full) = (run(m, end, steps) for m in made)
@@ -135,13 +141,16 @@ def test_two_bodies(update):
     assert_same(found, full)
 
 
-# ---- growth --------------------------------------------------------------------------------------
+# ---- spreading contact ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("wanted", [None, True])
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_dragged_away(cell, wanted):
-    """Out of what was kept at first: kept anew, or more if it is wanted; then all is as it was."""
+def test_contact_moves_beyond_the_retained_dofs(cell, wanted):
+    """Contact leaves the retained dofs: others are retained, or more, and results agree.
+
+    More are retained if condensation is requested.
+    """
     made = [Pressed(cell=cell, condensation=c, **TIGHT) for c in (wanted, False)]
     (steps, found), (_, full) = (run(m, 3.5, 7) for m in made)
     assert 1 <= n_grown(steps) <= 2
@@ -153,7 +162,7 @@ def test_dragged_away(cell, wanted):
 
 @ON_ONE_RANK
 def test_two_bodies_pressed_deep():
-    """The shoe, until contact is wider than what was kept at first."""
+    """Results agree as the contact of the shoe grows wider than the dofs retained at first."""
     made = [
         Shod(deep=0.05, condensation=c, small_displacement_tolerance=np.inf, **TIGHT)
         for c in (True, False)
@@ -165,7 +174,10 @@ def test_two_bodies_pressed_deep():
 
 @pytest.mark.parametrize("wanted", [None, True])
 def test_pressed_deep(wanted):
-    """Until most of the top touches: on all unknowns from then on, or on all that are touched."""
+    """Most of the top comes into contact: results agree.
+
+    From then on all dofs are used, or all coupled dofs are retained if condensation is requested.
+    """
     made = [
         Pressed(deep=0.12, condensation=c, small_displacement_tolerance=np.inf, **TIGHT)
         for c in (wanted, False)
@@ -180,8 +192,8 @@ def test_pressed_deep(wanted):
     assert_same(found, full)
 
 
-def test_field_last():
-    """Without every field nothing closes unseen, and nothing changes: bit for bit serially."""
+def test_recovering_only_the_last_interior_displacement():
+    """Results do not change, serially bit for bit: no point closes undetected."""
     made = [Pressed(condensation=True) for _ in range(2)]
     (steps, found), (others, every) = (
         run(m, 3.0, 6, recover_interior=field)
@@ -199,19 +211,19 @@ def test_field_last():
 
 @pytest.mark.parametrize("wanted", [None, True])
 def test_restart(wanted, tmp_path):
-    """Broken off after what is kept has grown, and taken up: the same digits; see `goes_on`."""
+    """A history restarted after more dofs are retained has the same digits (`goes_on`)."""
     make = lambda: Pressed(condensation=wanted)  # noqa: E731
     goes_on(make, shared_folder(tmp_path), stop=5, end=3.5)
 
 
-def test_restart_on_all_unknowns(tmp_path):
-    """The same where contact has spread too far to be condensed."""
+def test_restart_on_all_dofs(tmp_path):
+    """A restarted history has the same digits where contact is too wide to be condensed."""
     make = lambda: Pressed(deep=0.12, small_displacement_tolerance=np.inf)  # noqa: E731
     goes_on(make, shared_folder(tmp_path), stop=4, end=1.0, steps=5)
 
 
-def test_an_increment_that_fails():
-    """It leaves u, history and what comes next as if it had not been."""
+def test_failed_increment_has_no_effect():
+    """A failed increment changes neither u nor history nor the next increment (1e-9)."""
     made, twin = (Pressed(condensation=True, fallback=False) for _ in range(2))
     for m in (made, twin):
         run(m, 1.0)
@@ -233,7 +245,7 @@ def test_an_increment_that_fails():
 
 
 def test_units():
-    """The same unknowns, effort and digits in other units, 1e-9 of the field."""
+    """Retained dofs, effort and digits are the same in other units, to 1e-9 of the field."""
     made = [Pressed(length=length) for length in (1.0, 1e-3)]
     (one, a), (other, b) = (run(m, 2.0, 4) for m in made)
     assert kept(made[0]) == kept(made[1])
@@ -241,11 +253,11 @@ def test_units():
     assert close(b["u"] / 1e-3, a["u"], 1e-9)
 
 
-# ---- the choice ----------------------------------------------------------------------------------
+# ---- selection of candidates ---------------------------------------------------------------------
 
 
-def test_contact_everywhere(caplog):
-    """Laws that act where the gap is open, and prescribed gaps, have all of Γc for candidates."""
+def test_candidates_on_the_whole_surface(caplog):
+    """Laws that act at open points, and prescribed gaps, make all dofs of Γc candidates."""
     everywhere = {
         "tresca": (fc.Tresca(0.3, 8.0, k_n=1e5, k_t=1e5), {}),
         "tension": (fc.Foundation(k_n=1e4, k_t=1e4), {}),
@@ -265,7 +277,7 @@ def test_contact_everywhere(caplog):
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_any_number_of_ranks(cell):
-    """As many unknowns and growths as on one rank, as much effort, and the same forces."""
+    """Retained dofs, their growth, effort and forces are those on one rank."""
     made, alone = (Pressed(cell=cell, comm=comm, **TIGHT) for comm in (COMM, MPI.COMM_SELF))
     (steps, found), (serial, expected) = (run(m, 3.0, 6) for m in (made, alone))
     assert kept(made) == kept(alone)

@@ -1,7 +1,7 @@
-"""What is committed is what was solved: no constant, no field and no second call changes it.
+"""`commit` stores the solution of `solve`; changes of constants, fields and calls have no effect.
 
-The reference is the same history with nothing in between, to the last digit on one rank; on several
-MUMPS adds in the order in which messages come: 1e-10.
+The reference is the same history with no change in between. It is equal in all digits on one rank,
+and to 1e-10 on several, where the order of summation in MUMPS is that of the messages.
 """
 
 import numpy as np
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.three_ranks
 
 
 def slid(between, *, enforcement="penalty", recover_interior=True):
-    """A block pressed on a floor that is drawn along, three increments; forces and field."""
+    """Return forces, u and history of a block on a floor dragged in three increments."""
     scene = block("quadrilateral", n=4, up=-10.0)
     contact = {"displacement": np.zeros(2), "enforcement": enforcement}
     problem, contact = scene.problem(fc.Coulomb(0.3), scene.rollers(), contact=contact)
@@ -41,7 +41,7 @@ def nothing(problem, contact):
 
 
 def changed(problem, contact):
-    """Parameters of law and obstacle, which the next solve is to see and this commit is not."""
+    """Change parameters of law and obstacle, which must not affect this commit."""
     kept = {name: c.value.copy() for name, c in contact.parameters.items()}
     contact.parameters["friction"].value = 0.01
     contact.parameters["displacement"].value[:] = 0.5, 0.1
@@ -52,7 +52,7 @@ def changed(problem, contact):
 
 
 def moved(problem, contact):
-    """The displacement itself, set by hand."""
+    """Overwrite the displacement."""
     problem.u.x.array[:] += 1.0
     contact.states.forget()
 
@@ -62,7 +62,7 @@ def twice(problem, contact):
 
 
 def failed(problem, contact):
-    """An increment that is tried before the commit, and has no solution."""
+    """Solve an increment without a solution before the commit."""
     kept = contact.parameters["displacement"].value.copy()
     contact.parameters["displacement"].value[:] = np.nan
     with pytest.raises((fc.NotConverged, ValueError)):
@@ -74,16 +74,16 @@ def failed(problem, contact):
 @pytest.mark.parametrize("recover_interior", [True, False])
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 @pytest.mark.parametrize("between", [changed, moved, twice, failed])
-def test_commit_keeps_what_solve_found(between, enforcement, recover_interior):
+def test_commit_stores_the_solution_of_solve(between, enforcement, recover_interior):
     options = {"enforcement": enforcement, "recover_interior": recover_interior}
     expected, found = slid(nothing, **options), slid(between, **options)
     for a, b in zip(found, expected, strict=True):
         assert close(a, b, EXACT)
-    assert abs(expected[0][-1, 0]) > 0.1  # there is friction to go wrong
+    assert abs(expected[0][-1, 0]) > 0.1  # friction acts
 
 
-def test_a_second_commit_finds_no_other_pairs():
-    """With pairs found anew at commits, a commit that has nothing to commit changes nothing."""
+def test_second_commit_does_not_update_the_pairs():
+    """With pairs updated at commits, a commit without a new solution changes nothing."""
     body = stack("quadrilateral", (3, 4), (0.5, 0.5), widths=[1.5, 1.0])
     body.hold(FLOOR, 0, 1)
     slide = body.constant()
@@ -107,7 +107,7 @@ def test_a_second_commit_finds_no_other_pairs():
     assert close(step.contacts["contact"].normal_force, 1e4, 1e-8)
 
 
-def test_a_commit_before_any_solution_changes_nothing():
+def test_commit_before_any_solution_changes_nothing():
     scene = block("quadrilateral", up=-1.0)
     problem, contact = scene.problem(fc.Frictionless(), scene.rollers())
     before = contact.history.rows()
@@ -117,7 +117,7 @@ def test_a_commit_before_any_solution_changes_nothing():
 
 
 def pressed_and_drawn(late):
-    """A block pressed by one problem, then drawn aside, by another that is made then or by it."""
+    """Return step and u of a block pressed by one problem, then dragged by it or by a new one."""
     scene = block("quadrilateral", n=4, up=-5.0)
     contact = scene.contact(fc.Coulomb(0.3), displacement=np.zeros(2))
     bcs = scene.rollers()
@@ -139,10 +139,10 @@ def pressed_and_drawn(late):
     return step, nodal(scene.u)
 
 
-def test_another_problem_goes_on_with_a_history():
-    """Forces, field and energies are those of the one problem: what it starts from is loaded.
+def test_new_problem_continues_a_history():
+    """A problem that starts from a loaded state has u and energies of the previous one, to 1e-9.
 
-    To 1e-9, the solver's, which starts from elsewhere.
+    This is the solver's tolerance: the initial guess differs.
     """
     (one, u), (two, same) = pressed_and_drawn(late=False), pressed_and_drawn(late=True)
     assert close(same, u, 1e-9)
@@ -151,8 +151,8 @@ def test_another_problem_goes_on_with_a_history():
         assert abs(getattr(two.energy, name) - getattr(one.energy, name)) < 1e-9 * scale, name
 
 
-def test_a_history_that_another_problem_has_led_on_is_refused():
-    """Its energies and starts would be of a state that is gone. The refusal changes nothing."""
+def test_history_continued_by_another_problem_is_refused():
+    """Energies and predictors of the problem would be outdated. The error changes no state."""
     scene = block("quadrilateral", n=4, up=-5.0)
     contact = scene.contact(fc.Coulomb(0.3))
     first, second = (
@@ -170,7 +170,7 @@ def test_a_history_that_another_problem_has_led_on_is_refused():
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 def test_results_after_a_restore_are_those_of_the_commit(enforcement):
-    """Points that slipped in the committed increment do so still, whatever was tried since."""
+    """The status of points is that of the committed increment, also after later solves."""
     scene = block("quadrilateral", n=4, up=-10.0)
     contact = {"displacement": np.zeros(2), "enforcement": enforcement}
     problem, contact = scene.problem(fc.Coulomb(0.3), scene.rollers(), contact=contact)

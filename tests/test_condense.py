@@ -1,4 +1,4 @@
-"""Condensation: the Schur complement, the same results as on all unknowns, one factorisation."""
+"""Static condensation: Schur complement, results as on all dofs, one factorisation."""
 
 import logging
 
@@ -30,13 +30,13 @@ from scenes.two_blocks import Slider
 pytestmark = [pytest.mark.timeout(240), pytest.mark.three_ranks]
 COMM = MPI.COMM_WORLD
 
-# Both spaces solve to 1e-9 of the forces; a path adds up.
+# Both systems are solved to 1e-9 of the forces; errors add up along a load path.
 SAME = 1e-7
 TIGHT = {"snes_rtol": 1e-12}
 
 
 def both(make, run):
-    """Results of ``run`` for a scene made with and without condensation."""
+    """Return results of ``run`` for a scene with and without static condensation."""
     return [run(make(condensation=condensed)) for condensed in (True, False)]
 
 
@@ -51,7 +51,7 @@ def assert_same(condensed, whole, rtol=SAME):
 
 
 def dense(matrix):
-    """All of a matrix, on every rank."""
+    """Return the whole matrix on every rank."""
     pointers, columns, values = matrix.getValuesCSR()
     result = np.zeros((pointers.size - 1, matrix.getSize()[1]))
     result[np.repeat(np.arange(len(result)), np.diff(pointers)), columns] = values
@@ -61,7 +61,7 @@ def dense(matrix):
 @pytest.mark.parametrize("symmetric", [True, False])
 @pytest.mark.parametrize(("cell", "degree"), GRID)
 def test_schur_complement(cell, degree, symmetric):
-    """S, g and the recovered field against dense algebra: numpy, 1e-10 of the largest entry."""
+    """S, g and the recovered field agree with dense algebra to 1e-10 of the largest entry."""
     scene = block(cell, degree, shuffled=True, up=-1.0)
     if not symmetric:
         v = ufl.TestFunction(scene.u.function_space)
@@ -75,7 +75,7 @@ def test_schur_complement(cell, degree, symmetric):
     K = dense(problem.full.bulk.stiffness)
     n, whole = len(K), problem.full.unknowns
     touches = find_coupled_dofs(problem.full.operators, whole)
-    # All components of all nodes of the bottom, no others.
+    # Coupled dofs are all components of all nodes of the bottom, no others.
     y = scene.u.function_space.tabulate_dof_coordinates()[:, scene.dim - 1]
     bottom = np.flatnonzero(np.repeat(np.abs(y) < 1e-12, scene.dim))
     assert np.array_equal(touches, bottom[bottom < whole.n_local])
@@ -100,7 +100,7 @@ def test_schur_complement(cell, degree, symmetric):
 
     rng = np.random.default_rng(3)
     one, other = rng.normal(size=(2, n))
-    # The third is a combination of those before.
+    # The third force is a linear combination of the first two.
     for force in (one, other, 2.5 * one - other, rng.normal(size=n)):
         state = rng.normal(size=n)
         if force is not other:
@@ -118,8 +118,8 @@ def test_schur_complement(cell, degree, symmetric):
         assert close(found, field, 1e-10)
 
 
-def test_nothing_holds_a_part():
-    """A stiffness that is singular with the kept unknowns held is refused, on all ranks."""
+def test_singular_interior_stiffness_is_refused():
+    """A stiffness that is singular for fixed retained dofs is refused on all ranks."""
     scene = block("triangle")
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
     none = DofSubset(problem.full.unknowns, np.zeros(0, dtype=np.int32))
@@ -133,11 +133,11 @@ def test_nothing_holds_a_part():
     )
 
 
-# ---- the same results ----------------------------------------------------------------------------
+# ---- results with and without condensation -------------------------------------------------------
 
 
 def fields(made, steps=()):
-    """All of the final state and what the increments came to."""
+    """Return the final state, and forces and energies of the increments."""
     contact = made.contact
     found = {"u": owned(made.scene.u).copy(), "traction": contact.traction, "slip": contact.slip}
     found["force"] = np.array([s.contacts["contact"].force for s in steps])
@@ -156,11 +156,11 @@ LAWS = {
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize(("cell", "degree"), [("quadrilateral", 1), ("triangle", 2)])
-def test_path(cell, degree, law, method):
-    """To and fro with prescribed values that change: states, forces, works; one factorisation.
+def test_load_path(cell, degree, law, method):
+    """States, forces and energies agree under load reversals, with one factorisation.
 
-    Iterations are of the same order: the condensed Newton method is the same one, and half as many
-    again would be another one, or another start.
+    The number of iterations is at most 1.5 times that without condensation, since method and start
+    are the same.
     """
     iterations = {}
 
@@ -180,7 +180,7 @@ def test_path(cell, degree, law, method):
 
 @pytest.mark.parametrize(("cell", "degree"), GRID)
 def test_every_cell(cell, degree):
-    """The start of the path with Coulomb friction on all cells and degrees."""
+    """Results agree on all cells and degrees with Coulomb friction (start of the load path)."""
     mesh = {"n": 4 if cell in ("triangle", "quadrilateral") else 2}
 
     def make(**options):
@@ -191,7 +191,7 @@ def test_every_cell(cell, degree):
 
 @pytest.mark.parametrize("cell", CELLS)
 def test_deformable_obstacle(cell):
-    """A block slid over another, pairs found anew: the same, whatever was touched before."""
+    """Results agree for a block sliding over another, with updated pairs and retained dofs."""
     n = (7, 2)
     results = []
     for condensed in (True, False):
@@ -200,7 +200,7 @@ def test_deformable_obstacle(cell):
         steps = [made.step(0.002, along) for along in (0.0, 0.3, 0.6)]
         results.append(
             {
-                # In the order of places: a mesh may be divided otherwise when it is made again.
+                # Sorted by position, since the partition may differ between the two meshes.
                 "u": nodal(made.u),
                 "traction": at_points(made.contact, made.contact.traction),
                 "force": np.array([s.contacts["contact"].force for s in steps]),
@@ -214,7 +214,7 @@ def test_deformable_obstacle(cell):
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_driven_obstacle(cell, method):
-    """A ball driven by a force, dragged by a displacement: its motion is one of those kept."""
+    """The motion of a ball driven by a force and a displacement is a retained dof."""
     results = []
     for condensed in (True, False):
         scene = block(cell, n=4 if cell == "triangle" else 2)
@@ -241,7 +241,7 @@ def test_driven_obstacle(cell, method):
 
 
 def test_several_contacts_and_loads():
-    """A floor with friction and a wall, side and top loads in turn, nothing else that holds."""
+    """Results agree for a block without Dirichlet conditions on a floor and a wall, two loads."""
     results = []
     for condensed in (True, False):
         scene = block("triangle", 2, n=4)
@@ -258,15 +258,15 @@ def test_several_contacts_and_loads():
             step = problem.solve()
             problem.commit()
             found.append([r.force for r in step.contacts.values()])
-        # Both loads are two fields times numbers: factored once, and solved for once each.
+        # The loads are combinations of two fields, so that two solutions suffice.
         if condensed:
             assert len(problem.solver.system.condensation.load_directions) == 2
         results.append({"u": owned(scene.u).copy(), "forces": np.array(found)})
     assert_same(*results)
 
 
-def test_modulus_changed():
-    """A new modulus between increments: a new factorisation, and the results with it."""
+def test_changed_modulus_is_factored_anew():
+    """A new modulus between increments causes one new factorisation, and results agree."""
 
     def run(made):
         steps = []
@@ -281,8 +281,8 @@ def test_modulus_changed():
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
-def test_units(method):
-    """The same effort and digits in other units, 1e-9 of the fields."""
+def test_results_do_not_depend_on_units(method):
+    """Number of iterations and fields are the same in other units, fields to 1e-9."""
     results = []
     for length, pressure in [(1.0, 1.0), (1e-3, 1e6), (1e-9, 1e9)]:
         made = Rub(
@@ -298,8 +298,8 @@ def test_units(method):
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
-def test_failure_leaves_no_trace(method):
-    """An increment that fails leaves u, history and what comes next as if it had not been."""
+def test_failed_increment_changes_nothing(method):
+    """A failed increment changes neither u, nor the history, nor the following increments."""
     made, twin = (Rub(method=method, condensation=True) for _ in range(2))
     for m in (made, twin):
         walk(m, path=PATH[:2])
@@ -319,8 +319,8 @@ def test_failure_leaves_no_trace(method):
     assert_same(fields(made), fields(twin))
 
 
-def test_an_indefinite_bulk():
-    """A bulk that gives way: neither K nor S is definite, and all is as on all unknowns."""
+def test_indefinite_bulk():
+    """Results agree if neither K nor S is definite."""
     results = []
     for condensed in (True, False):
         scene = block("quadrilateral", up=-1.0)
@@ -335,11 +335,11 @@ def test_an_indefinite_bulk():
     assert_same(*results)
 
 
-# ---- the choice ----------------------------------------------------------------------------------
+# ---- choice of condensation ----------------------------------------------------------------------
 
 
-def test_the_choice(caplog):
-    """By default for a linear bulk; it is logged; True where it cannot be raises."""
+def test_default_of_condensation_is_logged(caplog):
+    """Linear bulks are condensed by default, with a log entry; impossible requests raise."""
     scene = block("triangle", n=4, up=-1.0)
     law = fc.Frictionless(k_n=5e3)
     with caplog.at_level(logging.INFO, logger="fenics_contact"):
@@ -371,8 +371,8 @@ def test_the_choice(caplog):
     assert PETSc.Options().getAll() == options
 
 
-def test_what_is_worth_it():
-    """Small surfaces, and large ones of large bodies; not the whole of a body, nor gigabytes."""
+def test_condensation_depends_on_numbers_of_dofs():
+    """Condensation is worthwhile for few retained dofs relative to all, if S fits in memory."""
     assert (
         is_worthwhile(50, 10, 2)
         and is_worthwhile(250_000, 1000, 2)
@@ -386,8 +386,8 @@ def test_what_is_worth_it():
 
 
 @pytest.mark.mpi
-def test_a_nonlinear_bulk_is_not_condensed():
-    """By default it iterates on all unknowns and says why."""
+def test_nonlinear_bulk_is_not_condensed():
+    """A nonlinear bulk is solved on all dofs by default."""
     scene = block("quadrilateral", up=-1.0)
     scene.F = kirchhoff(scene)
     problem, _ = scene.problem(fc.Frictionless(k_n=5e4), scene.rollers())

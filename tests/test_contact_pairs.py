@@ -1,7 +1,7 @@
 """Contacts between bodies that may touch, found by their distance.
 
-References are closed answers and equilibrium: 1e-10, where the solver's own tolerance on forces is
-1e-9 and linear scenes are met to round-off; what is solved for twice is the same to 1e-8.
+References are closed-form solutions and equilibrium, to 1e-10: the solver's tolerance on forces is
+1e-9, and linear problems are solved to round-off. Two solutions of one problem agree to 1e-8.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ FLOOR, ROOF, WEST, SOUTH = 1, 2, 3, 4
 
 
 def box(cell: str, low: Sequence[float], high: Sequence[float], n: Sequence[int]) -> tuple:
-    """A box with FLOOR, ROOF, WEST and in space SOUTH, its mesh and tags as `join_meshes` asks."""
+    """Return a box for `join_meshes`, with the tags FLOOR, ROOF, WEST and in 3D SOUTH."""
     d = dimension(cell)
     make = dolfinx.mesh.create_rectangle if d == 2 else dolfinx.mesh.create_box
     mesh = make(COMM, [np.array(low, float), np.array(high, float)], n, CellType[cell])
@@ -51,7 +51,7 @@ def box(cell: str, low: Sequence[float], high: Sequence[float], n: Sequence[int]
 
 
 def disc(centre: Sequence[float], radius: float, n: int) -> tuple:
-    """A disc of triangles, (mesh, None, None)."""
+    """Return a disc of triangles, (mesh, None, None)."""
     rings, places = np.arange(1, n + 1), [np.zeros((1, 2))]
     for ring in rings:
         angle = np.arange(6 * ring) * 2 * np.pi / (6 * ring)
@@ -62,9 +62,9 @@ def disc(centre: Sequence[float], radius: float, n: int) -> tuple:
 
 
 class Pressed:
-    """Bodies with ν = 0, joined; the roofs of some pressed, the floors of some held.
+    """Joined bodies with ν = 0, some with pressure on the ROOF, some with a fixed FLOOR.
 
-    All stand on rollers at WEST and SOUTH, free on the other sides.
+    All have rollers at WEST and SOUTH and are free on the other sides.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Pressed:
         moduli: dict[str, float] | None = None,
         degree: int = 1,
     ) -> None:
-        """Join them. Collective."""
+        """Join the bodies. Collective."""
         self.joined = joined = fc.join_meshes(parts)
         self.mesh, self.d = joined.mesh, joined.mesh.geometry.dim
         self.u = fem.Function(displacement_space(self.mesh, degree))
@@ -95,18 +95,18 @@ class Pressed:
                 self.bcs.append(self.hold(body, SOUTH, 1))
 
     def hold(self, body: str, tag: int, component: int) -> fem.DirichletBC:
-        """No displacement of a side in one direction."""
+        """Return a condition that fixes one displacement component of a side."""
         return hold(self.u, self.joined.facets, self.joined.facet(body, tag), component)
 
     def solve(self, contacts: list[fc.Contact], **options: Any) -> fc.Step:
-        """Of these contacts alone."""
+        """Solve and commit one increment with these contacts."""
         problem = fc.ContactProblem(self.F, self.u, bcs=self.bcs, contacts=contacts, **options)
         step = problem.solve()
         problem.commit()
         return step
 
     def shortened(self, body: str) -> Array:
-        """Displacements along the height, of the nodes of a body's roof."""
+        """Return the downward displacements of the nodes of a body's ROOF."""
         facets = self.joined.facets.find(self.joined.facet(body, ROOF))
         space = self.u.function_space.sub(self.d - 1)
         dofs = fem.locate_dofs_topological(space, self.d - 1, facets)
@@ -114,7 +114,7 @@ class Pressed:
 
 
 def three_blocks(cell: str) -> Pressed:
-    """A stack of three unit blocks, 3, 5 and 4 cells wide, pressed by 2, on top of each other."""
+    """Return a stack of three blocks of height 0.5, 3, 5 (3D: 2) and 4 cells wide, pressed by 2."""
     d = dimension(cell)
     parts = {}
     for i, (body, n) in enumerate((("low", 3), ("mid", 5 if d == 2 else 2), ("top", 4))):
@@ -125,12 +125,12 @@ def three_blocks(cell: str) -> Pressed:
 
 
 def up(contact: fc.Contact) -> float:
-    """Force on the body that has Γc, along the height."""
+    """Return the vertical contact force on the slave body."""
     return float(contact.resultants().force[-1])
 
 
 def facets_of(contact: fc.Contact) -> int:
-    """Number of facets of Γc."""
+    """Return the number of facets of Γc."""
     return COMM.allreduce(len(contact.surface.facets))
 
 
@@ -138,8 +138,8 @@ def facets_of(contact: fc.Contact) -> int:
 
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
-def test_a_stack_bears_its_load_through_every_joint(cell: str) -> None:
-    """Uniform stress, exactly: each joint bears the load, each block shortens by p h / E."""
+def test_stack_has_uniform_stress_and_the_load_in_every_joint(cell: str) -> None:
+    """Every joint has the force of the load, to 1e-10; every block shortens by p h / E, to 1e-9."""
     scene = three_blocks(cell)
     contacts = fc.find_contact_pairs(
         scene.u, fc.Frictionless(fc.RelativeStiffness(1e3)), 0.1, bodies=scene.joined
@@ -157,8 +157,8 @@ def test_a_stack_bears_its_load_through_every_joint(cell: str) -> None:
     assert found == pytest.approx(np.full(found.shape, expected), rel=1e-9)
 
 
-def test_the_same_as_sides_named_by_hand() -> None:
-    """Contacts of tagged sides give the same displacements."""
+def test_found_pairs_equal_contacts_of_tagged_sides() -> None:
+    """Contacts of tagged sides give the same displacements and forces, to 1e-8."""
     found = []
     for by_hand in (False, True):
         scene = three_blocks("quadrilateral")
@@ -183,8 +183,8 @@ def test_the_same_as_sides_named_by_hand() -> None:
 
 
 @pytest.mark.parametrize("fine", ["base", "blocks"])
-def test_two_blocks_on_one(fine: str) -> None:
-    """Each of two blocks side by side hands its own load on; facets below the gap serve both."""
+def test_two_blocks_on_one_base(fine: str) -> None:
+    """Each of two adjacent blocks transfers its load, to 1e-10; facets below the gap serve both."""
     n = {"base": (30, 1), "blocks": (12, 8)}[fine]
     parts = {
         "base": box("quadrilateral", (0, 0), (2, 1), (n[0], 8)),
@@ -209,7 +209,7 @@ def test_two_blocks_on_one(fine: str) -> None:
 
 
 def rubber_between_plates(by_hand: bool) -> list[fc.Contact]:
-    """A disc of rubber, pressed between two plates by a tenth of its height, solved."""
+    """Return the solved contacts of a rubber disc, compressed by a tenth between two plates."""
     mesh, _, _ = disc((0, 0), 0.5, 6)
     around = tagged(mesh, {ROOF: lambda x, cell: np.ones(len(x), dtype=bool)})
     parts = {
@@ -230,7 +230,7 @@ def rubber_between_plates(by_hand: bool) -> list[fc.Contact]:
         (space.sub(0), sideways), lambda x: (np.abs(x[0]) < 1e-9) & (np.abs(x[1]) < 0.49)
     )
     bcs.append(fem.dirichletbc(fem.Function(sideways), middle, space.sub(0)))
-    # Multiples of E/h are those of all of Γc, which is not the same by hand.
+    # Stiffness as a number: multiples of E/h depend on all of Γc, which differs for tagged sides.
     law = fc.Coulomb(0.3, k_n=100.0, k_t=100.0)
     if by_hand:
         surface = fc.ContactSurface(joined.mesh, tags, joined.facet("disc", ROOF))
@@ -253,10 +253,11 @@ def rubber_between_plates(by_hand: bool) -> list[fc.Contact]:
     return contacts
 
 
-def test_rubber_between_plates() -> None:
-    """At large strains: both plates press with one force, that of sides named by hand.
+def test_rubber_disc_between_plates() -> None:
+    """At large strains both plates have equal forces (1e-8), those of tagged sides (1e-7).
 
-    The disc is held sideways alone. The plates, farther apart than the search, are no pair.
+    The disc is constrained laterally only. The plates are farther apart than the search distance
+    and no pair.
     """
     found, expected = rubber_between_plates(by_hand=False), rubber_between_plates(by_hand=True)
     assert [contact.name for contact in found] == ["below-disc", "disc-above"]
@@ -268,9 +269,9 @@ def test_rubber_between_plates() -> None:
 
 
 def fork(seed: int | None = None) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """A block 1 high and wide with a slot 0.1 wide from its top down to 0.2: mesh and tags.
+    """Return mesh and tags of a unit square with a slot 0.1 wide from its top down to y = 0.2.
 
-    Its cells by chance in another order, where a seed is given.
+    The order of its cells is random if a seed is given.
     """
     serial = dolfinx.mesh.create_rectangle(
         MPI.COMM_SELF, [(0.0, 0.0), (1.0, 1.0)], (20, 10), CellType.quadrilateral
@@ -292,8 +293,8 @@ def fork(seed: int | None = None) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshT
     return mesh, tagged(mesh, sides)
 
 
-def test_a_body_that_touches_itself() -> None:
-    """The legs of a fork are pressed together: as with its sides named by hand; forces cancel."""
+def test_self_contact_equals_contact_of_tagged_sides() -> None:
+    """The legs of a fork pressed together have the force of tagged slot faces, to 1e-7."""
     found = []
     for by_hand in (False, True):
         mesh, tags = fork()
@@ -320,12 +321,12 @@ def test_a_body_that_touches_itself() -> None:
         assert facets_of(contact) == 8
     (first, one), (_, other) = found
     assert first.name == "1-1"
-    # Γc may be the other leg, which is its mirror image.
+    # Γc may be on the other leg, which is the mirror image.
     assert one > 0.05 and one == pytest.approx(other, rel=1e-7)
 
 
-def test_the_side_of_a_body_that_touches_itself_is_told_by_its_place() -> None:
-    """Γc is the left side of the slot, however cells are numbered and on any number of ranks."""
+def test_slave_side_of_self_contact_is_independent_of_cell_numbering() -> None:
+    """Γc is the left side of the slot for any numbering of cells and any number of ranks."""
     for seed in range(5):
         mesh, _ = fork(seed)
         u = fem.Function(displacement_space(mesh, 1))
@@ -333,8 +334,8 @@ def test_the_side_of_a_body_that_touches_itself_is_told_by_its_place() -> None:
         assert np.allclose(gathered(mesh.comm, contact.points)[:, 0], 0.45)
 
 
-def test_a_hole_faces_itself_all_around(caplog: pytest.LogCaptureFixture) -> None:
-    """Its facets have no two sides: all are Γc and all are opposite, and it is said."""
+def test_all_facets_of_a_hole_are_slave_and_master(caplog: pytest.LogCaptureFixture) -> None:
+    """The facets of a hole have no two sides: all are slave and master, and the log states it."""
     angle = 2 * np.pi * np.arange(16) / 16
     rings = [r * np.column_stack([np.cos(angle), np.sin(angle)]) for r in (1.0, 1.5)]
     i, j = np.arange(16), (np.arange(16) + 1) % 16
@@ -347,17 +348,17 @@ def test_a_hole_faces_itself_all_around(caplog: pytest.LogCaptureFixture) -> Non
         )
     assert facets_of(contact) == 16
     points = gathered(COMM, contact.gap)
-    # Across the hole, from facet to facet: the diameter of the inscribed circle, at the middle.
+    # The gap across the hole at the middle of facets is the diameter of the inscribed circle.
     assert points.min() == pytest.approx(2 * np.cos(np.pi / 16))
     if COMM.rank == 0:
         assert "all facets are on both sides" in caplog.text
 
 
-# ---- which are found, and which side is Γc -------------------------------------------------------
+# ---- pairs that are found, and choice of the slave side ------------------------------------------
 
 
 def test_bodies_far_apart_are_not_paired(caplog: pytest.LogCaptureFixture) -> None:
-    """Discs 1 apart: no contact below that distance, one above it, and it is said."""
+    """Discs at distance 1 are paired above it only; the warning and the log state the distances."""
     joined = fc.join_meshes([disc((0, 0), 1, 4), disc((3, 0), 1, 5)])
     u = fem.Function(displacement_space(joined.mesh, 1))
     with pytest.warns(UserWarning, match=r"no two of the bodies \[1, 2\] are within 0.9"):
@@ -370,20 +371,20 @@ def test_bodies_far_apart_are_not_paired(caplog: pytest.LogCaptureFixture) -> No
         (contact,) = fc.find_contact_pairs(u, fc.Frictionless(), 1.3)
     assert contact.name == "1-2"
     if COMM.rank == 0:
-        # Γc on the finer one, from its corner at distance 1 from the other's.
+        # Γc is on the finer disc; its vertex is at distance 1 from the vertex of the other.
         assert "1-2: Γc on 2 with" in caplog.text and "; 1 to 1." in caplog.text
     x = gathered(COMM, contact.points)
     assert np.all(x[:, 0] > 1.9) and facets_of(contact) > 3
 
 
 def test_back_sides_are_not_paired() -> None:
-    """A pile of plates thinner than the distance: neighbours only face each other."""
+    """In a stack of plates thinner than the search distance only facing sides are paired."""
     parts = [box("quadrilateral", (0, 0.1 * i), (1, 0.1 * (i + 1)), (8 + i, 1)) for i in range(3)]
     joined = fc.join_meshes(parts)
     u = fem.Function(displacement_space(joined.mesh, 1))
     contacts = fc.find_contact_pairs(u, fc.Frictionless(), 0.15, bodies=joined, self_contact=True)
     names = [contact.name for contact in contacts]
-    # Across the plate between them the outer two face each other, too: open while it is there.
+    # The outer plates also face each other across the middle one; this contact stays open.
     assert names == ["0-1", "0-2", "1-2"]
     for contact, y in zip(contacts, (0.1, 0.2, 0.2), strict=True):
         x = gathered(COMM, contact.points)
@@ -392,8 +393,8 @@ def test_back_sides_are_not_paired() -> None:
     assert [contact.name for contact in close] == ["0-1", "1-2"]
 
 
-def test_bodies_that_overlap_from_the_start() -> None:
-    """An interference of a fifth of a cell is found; one of more than half a cell is no contact."""
+def test_initial_overlap_is_found_up_to_half_a_cell() -> None:
+    """An overlap of a fifth of a cell is a contact; one of more than half a cell is not."""
     for depth, n_contacts in ((0.05, 1), (0.2, 0)):
         parts = [
             box("quadrilateral", (0, 0), (1, 1), (4, 4)),
@@ -408,8 +409,8 @@ def test_bodies_that_overlap_from_the_start() -> None:
             assert facets_of(contact) == 5 and gap == pytest.approx(np.full(len(gap), -depth))
 
 
-def test_which_side_is_the_surface() -> None:
-    """The finer one; of equal ones that with fewer facets; or what the caller says."""
+def test_choice_of_the_slave_side() -> None:
+    """Γc is the finer side, of equal ones that with fewer facets, or given by `slave_bodies`."""
     law = fc.Frictionless()
     for n, width, expected in ((8, 1.0, 1), (3, 1.0, 0), (2, 0.5, 1), (1, 0.5, 0)):
         parts = [
@@ -427,8 +428,8 @@ def test_which_side_is_the_surface() -> None:
             assert looks == (chosen == 0)
 
 
-def test_cell_tags_and_connected_parts_name_bodies() -> None:
-    """The same two bodies under three kinds of names; only some facets are looked at."""
+def test_bodies_are_named_by_cell_tags_or_connected_parts() -> None:
+    """Three ways to name the same two bodies give one contact; `tags` restricts the facets."""
     parts = {
         "a": box("triangle", (0, 0), (1, 1), (3, 3)),
         "b": box("triangle", (0, 1), (1, 2), (4, 4)),
@@ -448,8 +449,8 @@ def test_cell_tags_and_connected_parts_name_bodies() -> None:
     assert len(fc.find_contact_pairs(u, fc.Frictionless(), 0.1, **only)) == 1
 
 
-def test_a_law_for_each_pair() -> None:
-    """It is asked by the names of both bodies."""
+def test_law_can_be_a_function_of_the_pair() -> None:
+    """A callable law is called with the names of both bodies."""
     scene = three_blocks("quadrilateral")
     asked = []
 
@@ -465,8 +466,8 @@ def test_a_law_for_each_pair() -> None:
     assert all(contact.multipliers is not None for contact in contacts)
 
 
-def test_bad_arguments() -> None:
-    """What was given and what is expected, on every rank."""
+def test_invalid_arguments_are_reported_on_every_rank() -> None:
+    """Errors state the given and the expected argument, on every rank."""
     mesh, _, _ = box("triangle", (0, 0), (1, 1), (2, 2))
     joined = fc.join_meshes([mesh, box("triangle", (0, 1), (1, 2), (2, 2))[0]])
     u = fem.Function(displacement_space(joined.mesh, 1))

@@ -1,4 +1,4 @@
-"""Continuation in stiffness: stiff contact from a cold start, by every method; what was tried."""
+"""Tests of continuation in stiffness, stiff contact from a cold start, and lists of attempts."""
 
 import logging
 
@@ -20,8 +20,8 @@ SERIAL = pytest.mark.skipif(COMM.size > 1, reason="the same on several ranks, an
 @pytest.mark.parametrize(
     ("cell", "degree"), [("triangle", 2), ("quadrilateral", 1), ("hexahedron", 1)]
 )
-def test_the_same_solution(cell, degree):
-    """Where Newton's method does it directly both satisfy the law to 1e-9: states agree to 1e-6."""
+def test_continuation_agrees_with_newton(cell, degree):
+    """If Newton's method converges, too, both have residuals of 1e-9 and states agree to 1e-6."""
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
     states = []
     for method in ("continuation", "newton"):
@@ -34,10 +34,10 @@ def test_the_same_solution(cell, degree):
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_a_start_that_is_a_solution(cell):
-    """The same increment once more: there is nothing to iterate on. Reference: the state, to 1e-9.
+def test_start_at_a_solution_takes_no_iterations(cell):
+    """Solving the same increment again takes no iterations and keeps the state, to 1e-9.
 
-    It was led away from by soft contact, and where an obstacle had carried a body, not back.
+    Softened contact would move away from it, and not back if an obstacle had carried a body.
     """
     scene, problem, _ = pressed(cell, fc.Coulomb(0.3, k_n=2e4, k_t=1e4), "continuation", n=3)
     problem.solve()
@@ -50,10 +50,10 @@ def test_a_start_that_is_a_solution(cell):
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize(("factor", "friction"), [(1e6, 0.0), (1e8, 0.0), (1e4, 0.3), (1e6, 0.3)])
 def test_stiff_contact_from_a_cold_start(method, factor, friction):
-    """One increment from nothing: penetration is next to none, and the force that of hard contact.
+    """One increment from zero has negligible penetration and the force of hard contact.
 
-    Reference: the same at k_n h/E = 1e3, whose penetration, a thousandth of a cell, moves the force
-    by as much; 2e-2 with friction, where points that slipped may stick.
+    Reference: the force at k_n h/E = 1e3, to 1e-3, the effect of its penetration of 1e-3 of a cell;
+    to 2e-2 with friction, where points that slipped may stick.
     """
     forces = []
     for scaled in (fc.RelativeStiffness(1e3), fc.RelativeStiffness(factor)):
@@ -63,19 +63,19 @@ def test_stiff_contact_from_a_cold_start(method, factor, friction):
         forces.append(step.contacts["contact"].normal_force)
     assert close(forces[1], forces[0], 2e-2 if friction else 1e-3)
     assert step.contacts["contact"].max_penetration < 1e-1 / factor
-    # Whole steps of Newton's method solve it without friction, a piecewise linear problem.
+    # Full Newton steps solve the frictionless problem, which is piecewise linear.
     fallbacks = [] if method == "newton" else ["continuation"]
-    if friction:  # which the primal-dual method is for; at 1e6 E/h it fails here
+    if friction:  # the primal-dual method is for friction; at 1e6 E/h it fails
         fallbacks = ["primal_dual"] if factor < 1e5 else ["primal_dual", "continuation"]
     assert [a.method for a in step.attempts] == [method, *fallbacks]
     assert [a.outcome == "converged" for a in step.attempts] == [False] * len(fallbacks) + [True]
     assert step.iterations == sum(attempt.iterations for attempt in step.attempts)
 
 
-def test_without_a_fallback_it_fails_and_says_why(caplog):
-    """Newton's method with full steps goes round in a cycle: the points that do are named.
+def test_failure_without_fallback_names_chattering_points(caplog):
+    """Newton's method with full steps cycles, and the error names the points that change status.
 
-    That they sit under the middle of the ball, where contact is, is told from the geometry.
+    By the geometry they lie under the middle of the ball, where contact is.
     """
     stiff = fc.RelativeStiffness(1e4)
     law = fc.Coulomb(0.3, stiff, stiff)
@@ -86,7 +86,7 @@ def test_without_a_fallback_it_fails_and_says_why(caplog):
     with caplog.at_level(logging.INFO, "fenics_contact"), pytest.raises(fc.NotConverged) as caught:
         problem.solve()
     (attempt,) = caught.value.attempts
-    # All that it may take: a cycle does not end by itself.
+    # The maximum number of iterations: a cycle does not end by itself.
     assert attempt.method == "newton" and attempt.iterations == caught.value.iterations == 100
     for text in (attempt.outcome, str(caught.value)):
         assert "contact chatters" in text and "16 points keep changing between" in text
@@ -96,14 +96,14 @@ def test_without_a_fallback_it_fails_and_says_why(caplog):
 
 
 def test_every_failure_is_logged(caplog):
-    """What failed is in the log and in the step, in its order."""
+    """Every failed method is in the log and, in order, in the attempts of the step."""
     stiff = fc.RelativeStiffness(1e6)
     law = fc.Coulomb(0.3, stiff, stiff)
     _, problem, _ = pressed("quadrilateral", law, "newton", n=8)
     with caplog.at_level(logging.INFO, "fenics_contact"):
         step = problem.solve()
     texts = [record.getMessage() for record in caplog.records]
-    (first, *_) = COMM.allgather(texts)  # rank 0 speaks
+    (first, *_) = COMM.allgather(texts)  # rank 0 logs
     *failed, last = step.attempts
     assert [a.method for a in failed] == ["newton", "primal_dual"]
     assert (last.method, last.outcome) == ("continuation", "converged")
@@ -111,11 +111,11 @@ def test_every_failure_is_logged(caplog):
         assert any(str(attempt) in text for text in first)
 
 
-def test_history_is_led_through():
-    """A cycle of loads with friction: softened problems leave nothing in the history.
+def test_continuation_does_not_affect_the_history():
+    """Softened problems leave nothing in the history of a load cycle with friction.
 
-    Reference: L-BFGS, which solves the increments as they are; two solutions within the solver's
-    tolerance, and friction takes energy in every increment.
+    Reference: L-BFGS, which solves the increments directly, to 1e-5: both solutions are within the
+    solver's tolerance. Friction dissipates energy in every increment.
     """
     ends = []
     for method in ("continuation", "lbfgs"):
@@ -127,8 +127,8 @@ def test_history_is_led_through():
     assert close(*ends, 1e-5)
 
 
-def test_cut_increments_tell_what_was_tried():
-    """Every failed try, every cut and the success, in their order."""
+def test_cut_increments_list_all_attempts():
+    """The attempts are all failures, all cuts and the success, in order."""
     scene = block("triangle", up=0.0)
     push = fem.Constant(scene.mesh, 0.0)
     bcs = [*scene.rollers(), scene.hold(TOP, 1, push)]
@@ -154,11 +154,11 @@ def test_cut_increments_tell_what_was_tried():
     assert first.load == -0.0025 and all(len(step.attempts) == 1 for step in rest)
 
 
-def test_a_first_increment_that_cannot_be_alternated():
-    """With finite kinematics and friction nothing can be alternated: Newton's method solves it.
+def test_finite_kinematics_with_friction_start_with_newton():
+    """Finite kinematics with friction exclude the alternating method: Newton's method is used.
 
-    On a flat floor both kinematics are one problem: the same force, to the tolerance of 1e-9 of
-    both residuals.
+    On a flat floor small and finite kinematics are the same problem: the forces agree to 1e-7, with
+    residuals of 1e-9.
     """
     forces, attempts = [], ()
     for kinematics in ("small", "finite"):

@@ -1,4 +1,4 @@
-"""Where two features meet: each test holds what went wrong where both had tests of their own."""
+"""Regression tests of combined features that had separate tests only."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ K_N = 1e7
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
-def test_a_law_with_its_own_normal_part_where_points_have_no_opposite():
-    """A wide block on a narrow one: half of the points of Γc are unpaired, and bear nothing."""
+def test_law_with_normal_compliance_is_solved_with_unpaired_points():
+    """A wide block on a narrow one is solved with half of the points of Γc unpaired."""
     body = stack("quadrilateral", (3, 6), (0.5, 0.5), widths=[0.5, 1.0])
     surface = fc.ContactSurface(body.mesh, body.tags, 10 + UPPER)
     law = Asperities(0.3, 0.5, 2e-3, fc.RelativeStiffness())
@@ -35,10 +35,11 @@ def test_a_law_with_its_own_normal_part_where_points_have_no_opposite():
 
 
 @pytest.mark.parametrize("release", [None, 0.0])
-def test_pairs_found_anew_in_bodies_that_penetrate(release, tmp_path):
-    """Going on from a file finds the pairs of an uninterrupted history: points behind keep theirs.
+def test_restart_finds_the_same_pairs_of_penetrating_bodies(release, tmp_path):
+    """A restart finds the pairs of the uninterrupted history, also of penetrating points.
 
-    The same digits, 1e-9, of all that follows; by a soft penalty the points are well inside.
+    Displacement and force of the next increment agree to 1e-9. The penalty is soft, so that points
+    penetrate deeply.
     """
 
     def load(made):
@@ -67,8 +68,8 @@ def test_pairs_found_anew_in_bodies_that_penetrate(release, tmp_path):
     assert close(rest[0].contacts["contact"].force, whole.contact.resultants().force, 1e-9)
 
 
-def test_a_commit_that_fails_while_pairs_are_found(monkeypatch):
-    """The second of two contacts fails: pairs, jumps and history of the first are as before."""
+def test_commit_that_fails_in_the_pair_search_changes_no_state(monkeypatch):
+    """After a pair search that fails, a solve gives the results of a restored twin, to 1e-9."""
     law = fc.Coulomb(0.2, K_N, K_N)
     made, twin = (Slider("quadrilateral", law, start=0.4) for _ in range(2))
     for each in (made, twin):
@@ -95,8 +96,8 @@ def test_a_commit_that_fails_while_pairs_are_found(monkeypatch):
     assert close(made.contact.resultants().force, twin.contact.resultants().force, 1e-9)
 
 
-def test_a_foundation_without_tangential_stiffness_on_a_curved_obstacle():
-    """What small displacements change is told there, too, where k_t is zero."""
+def test_foundation_without_tangential_stiffness_on_a_ball():
+    """The small-displacement error is finite also where k_t is zero."""
     scene = block("quadrilateral", n=4)
     law = fc.Foundation(1e3, fem.Constant(scene.mesh, 0.0))
     push = [scene.hold(TOP, i, fem.Constant(scene.mesh, v)) for i, v in enumerate((0.01, -0.05))]
@@ -106,8 +107,8 @@ def test_a_foundation_without_tangential_stiffness_on_a_curved_obstacle():
     assert verdict.failures == [] and np.isfinite(verdict.small_displacement_error["contact"].worst)
 
 
-def test_a_law_that_no_pressure_gives_a_potential():
-    """A foundation that lets go: the alternation is refused by name, and no end of the fallback."""
+def test_law_without_potential_is_refused_by_the_alternating_method():
+    """A foundation without tension is refused; as a fallback the method fails without an error."""
     scene = block("quadrilateral", n=2, up=-1.0)
     law = fc.Foundation(1e3, 1e2, tension=False)
     with pytest.raises(ValueError, match="Foundation has no potential"):
@@ -118,8 +119,8 @@ def test_a_law_that_no_pressure_gives_a_potential():
     assert problem.solve().verdict.failures == []
 
 
-def test_no_contact_and_the_last_resort():
-    """Without any contact the methods that follow give up in good order."""
+def test_fallback_without_contact_fails_without_an_error():
+    """Without any contact the alternating method reports failure instead of raising."""
     scene = block("quadrilateral", n=2, up=-1.0)
     problem = fc.ContactProblem(
         scene.F, scene.u, bcs=[scene.hold(TOP, i) for i in (0, 1)], method="newton"
@@ -127,8 +128,8 @@ def test_no_contact_and_the_last_resort():
     assert problem.solver.methods["alternating"].solve()[1] < 0
 
 
-def test_a_form_that_cannot_hold_the_contact_has_no_potential_either():
-    """Between two bodies u itself stands in no potential on Γc."""
+def test_contact_between_bodies_has_no_potential():
+    """Contact between two bodies cannot be written as a potential in u on Γc: refused."""
     made = Slider("quadrilateral", fc.Frictionless(K_N), start=0.4)
     with pytest.raises(ValueError, match="opposing body"):
         made.contact.potential()

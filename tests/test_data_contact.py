@@ -1,4 +1,4 @@
-"""Contact on rigid obstacles from data, and on obstacles of one's own: as by formulas."""
+"""Contact with sampled and user-defined obstacles agrees with contact with analytic ones."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HISTORY = [(0.0, -0.06, 0.0), (0.04, -0.12, 0.1), (-0.02, -0.1, 0.3)]
 
 
 def pressed(cell, obstacle, *, law=None, unit=1.0, degree=1, cross_check=False, **contact):
-    """The forces on the body when a tool presses, is dragged and turned, (n, gdim)."""
+    """Return the forces on the body while a tool is pressed, dragged and rotated, (n, gdim)."""
     scene = rubber(cell, degree, n=(8, 4) if cell == "triangle" else (4, 2), E=1000.0)
     scene.mesh.geometry.x[:] *= unit
     d = scene.dim
@@ -41,12 +41,12 @@ def pressed(cell, obstacle, *, law=None, unit=1.0, degree=1, cross_check=False, 
 
 
 def length(x):
-    """Length of a vector (UFL)."""
+    """Return the length of a vector (UFL)."""
     return ufl.sqrt(ufl.dot(x, x))
 
 
 def tool(d, shape, unit=1.0):
-    """`disc` of radius 0.8 as a function of its motion."""
+    """Return a function that makes a `disc` of radius 0.8 from its displacement and angle."""
 
     def make(shift, angle):
         centre = unit * np.array((0.0,) * (d - 1) + (1.8,))
@@ -55,7 +55,7 @@ def tool(d, shape, unit=1.0):
         away, reach = ufl.as_vector(list(centre)), 0.8 * unit
         if shape == "ball":
             return fc.Ball(centre, 0.8 * unit, **move)
-        if shape == "distance":  # whose curvature the quadrature of Γc does not follow
+        if shape == "distance":  # the quadrature of Γc is not adapted to its curvature
             return fc.SignedDistance(
                 lambda x: ufl.sqrt(ufl.dot(x - away, x - away)) - reach, **move
             )
@@ -76,8 +76,8 @@ def tool(d, shape, unit=1.0):
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_a_spline_presses_as_its_cylinder(cell, enforcement):
-    """Forces in a history with friction: those of the `Cylinder` to 1e-6 of the largest.
+def test_spline_agrees_with_the_cylinder(cell, enforcement):
+    """Forces over a history with friction are those of the `Cylinder`, to 1e-6 of the largest.
 
     The spline's distance differs by 1e-9 radii, its normal by 1e-6.
     """
@@ -89,11 +89,12 @@ def test_a_spline_presses_as_its_cylinder(cell, enforcement):
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_facets_press_as_the_ball_that_they_approach(cell):
-    """The force that presses, with an error of second order in the size of the facets.
+def test_faceted_ball_converges_to_the_ball(cell):
+    """The error of the normal force is of second order in the facet size.
 
-    To four and twice finer ones: 256 and 16 times less after two, of which half is asked for,
-    because facets come to lie by chance. Their directions are of first order: so is what is aside.
+    Facets are refined twice, by four in the plane and by two in space: the error falls by 256 and
+    16, of which half is required, because the positions of the facets are arbitrary. Their normals
+    are of first order, and so are the tangential forces.
     """
     d = 2 if cell == "triangle" else 3
     law = fc.Frictionless(1e4)
@@ -107,10 +108,10 @@ def test_facets_press_as_the_ball_that_they_approach(cell):
 
 
 @pytest.mark.parametrize("shape", ["spline", 30])
-def test_units_do_not_matter(shape):
-    """Lengths in other units: the same forces by area to 1e-7.
+def test_forces_are_independent_of_the_unit_of_length(shape):
+    """Forces by area agree between units of length, to 1e-7.
 
-    And at every solution what is assembled from the boundary form is what the points bear.
+    Nodal forces of every solution with unit 1 agree with those assembled from the boundary form.
     """
     one = pressed("triangle", tool(2, shape), cross_check=True)
     for unit in (1e-6, 1e6):
@@ -118,8 +119,8 @@ def test_units_do_not_matter(shape):
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_a_spline_driven_by_a_force(kinematics):
-    """It goes as far as the `Cylinder` does, pressed by a force and dragged: 1e-6 of the way."""
+def test_spline_driven_by_a_force_agrees_with_the_cylinder(kinematics):
+    """Displacements of a spline and a `Cylinder`, pressed by a force and dragged, agree to 1e-6."""
     went = []
     for shape in ("cylinder", "spline"):
         scene = rubber("triangle", n=(8, 4), linear=True)
@@ -147,17 +148,17 @@ def test_a_spline_driven_by_a_force(kinematics):
 
 
 class Bubble(fc.SampledObstacle):
-    """A ball as one's own obstacle in numbers: a class with three members."""
+    """A user-defined sampled ball: a class with three members."""
 
     gdim, fingerprint = 2, "bubble"
 
     def __init__(self, centre, radius, displacement, rotation):
-        """See the arguments of a `Ball`."""
+        """Place the ball; the arguments are those of a `Ball`."""
         self.centre, self.radius = np.asarray(centre), radius
         self.displacement, self.rotation = displacement, rotation
 
     def sample(self, x):
-        """See `SampledObstacle.sample`."""
+        """Sample the ball, as `SampledObstacle.sample` requires."""
         arm = x - self.centre
         length = np.linalg.norm(arm, axis=1)
         out = arm / length[:, None]
@@ -165,8 +166,8 @@ class Bubble(fc.SampledObstacle):
         return fc.Sample(length - self.radius, -out, bend)
 
 
-def test_an_obstacle_of_ones_own_in_numbers():
-    """A ball by numpy alone: the forces of the `Ball` to round-off and what Newton leaves, 1e-9."""
+def test_user_defined_sampled_ball_agrees_with_ball():
+    """Forces are those of the `Ball`, to round-off and the tolerance of Newton's method, 1e-9."""
 
     def bubble(shift, angle):
         return Bubble((0.0, 1.8), 0.8, shift, fc.Rotation(angle, (0.0, 1.8)))
@@ -175,15 +176,15 @@ def test_an_obstacle_of_ones_own_in_numbers():
 
 
 class NoDistance(Bubble):
-    """A ball whose distance, or whose normal, is not one."""
+    """A ball whose distance or normal is wrong."""
 
     def __init__(self, scale, tilt, shift):
-        """``scale`` times the distance, and the normal turned by ``tilt`` (radians)."""
+        """Scale the distance by ``scale`` and rotate the normal by ``tilt`` (radians)."""
         super().__init__((0.5, -0.8), 0.8, shift, None)
         self.scale, self.tilt = scale, tilt
 
     def sample(self, x):
-        """See `SampledObstacle.sample`."""
+        """Sample the ball with its wrong distance and normal."""
         c, s = np.cos(self.tilt), np.sin(self.tilt)
         found = super().sample(x)
         normal = found.normal @ np.array([[c, s], [-s, c]])
@@ -193,8 +194,8 @@ class NoDistance(Bubble):
 @pytest.mark.whole
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize(("scale", "tilt"), [(1.0, 0.0), (2.0, 0.0), (0.9, 0.0), (1.0, 0.1)])
-def test_numbers_that_are_no_distance(scale, tilt, kinematics):
-    """Twice the distance was verified, with twice the force, and so was a normal that leans."""
+def test_samples_that_are_no_distance_are_refused(scale, tilt, kinematics):
+    """Twice the distance was accepted, with twice the force, and so was an inclined normal."""
     scene = block("triangle", 1, n=6)
     up = fem.Constant(scene.mesh, np.zeros(2))
     given = {"obstacle": NoDistance(scale, tilt, up), "kinematics": kinematics}
@@ -212,10 +213,10 @@ def test_numbers_that_are_no_distance(scale, tilt, kinematics):
 
 @pytest.mark.parametrize("spread", [1e-2, 1e-6])
 @pytest.mark.parametrize("shape", ["profile", "facets"])
-def test_differences_across_edges(shape, spread):
-    """Around the edges and corners of an L in the plane, and of a cube: at most 4 % of the normal.
+def test_gradient_error_is_small_at_edges_and_corners(shape, spread):
+    """Around edges and corners of an L in the plane and of a cube it is at most 4 % of the normal.
 
-    Reference: the distance to a corner, of which a step of 0.05 sideways takes 2.5 % in each
+    Reference: the distance to a corner, which a step of 0.05 sideways changes by 2.5 % in each
     direction.
     """
     rng = np.random.default_rng(1)
@@ -239,16 +240,16 @@ def test_differences_across_edges(shape, spread):
 
 
 class Faulty(fc.SampledObstacle):
-    """A floor that says something wrong of places below it at the right."""
+    """A floor whose samples are wrong at places below it on the right."""
 
     gdim, fingerprint, displacement, rotation = 2, "faulty", None, None
 
     def __init__(self, fault):
-        """``fault``: what is wrong."""
+        """Set the kind of the error, ``fault``."""
         self.fault = fault
 
     def sample(self, x):
-        """See `SampledObstacle.sample`."""
+        """Sample the floor with its fault."""
         distance, normal = x[:, 1].copy(), np.tile([0.0, -1.0], (len(x), 1))
         wrong = (distance < -1e-6) & (x[:, 0] > 0.9)
         if wrong.any() and self.fault == "error":
@@ -267,8 +268,8 @@ class Faulty(fc.SampledObstacle):
         ("error", RuntimeError, "beyond my data"),
     ],
 )
-def test_an_obstacle_in_numbers_that_fails_on_the_way(fault, error, text):
-    """A NaN is no open gap, and the error of one rank is raised on all of them."""
+def test_error_of_a_sample_during_the_iteration_is_raised(fault, error, text):
+    """A NaN does not count as an open gap, and the error of one rank is raised on all ranks."""
     scene = block("triangle", 1, n=4)
     down = fem.Constant(scene.mesh, 0.0)
     bcs = [scene.hold(TOP, 0), scene.hold(TOP, 1, down)]
@@ -284,8 +285,8 @@ def test_an_obstacle_in_numbers_that_fails_on_the_way(fault, error, text):
 
 
 @pytest.mark.parametrize("missing", ["gdim", "fingerprint", "sample"])
-def test_an_obstacle_in_numbers_that_says_too_little(missing):
-    """What a subclass leaves out is named where the contact is made."""
+def test_missing_members_of_a_sampled_obstacle_are_named(missing):
+    """The error names the missing member of a subclass when the contact is made."""
     said = {"gdim": 2, "fingerprint": "flat", "sample": Faulty.sample}
     del said[missing]
     obstacle = type("Floor", (fc.SampledObstacle,), said)()
@@ -298,8 +299,8 @@ def test_an_obstacle_in_numbers_that_says_too_little(missing):
     )
 
 
-def test_an_obstacle_that_says_nothing():
-    """A subclass of `Obstacle` without a place is refused by name."""
+def test_obstacle_without_place_is_refused():
+    """A subclass of `Obstacle` without ``place`` is refused by name."""
     obstacle = type("Nowhere", (fc.Obstacle,), {})()
     scene = block("triangle", 1)
     raised_everywhere(
@@ -310,16 +311,16 @@ def test_an_obstacle_that_says_nothing():
     )
 
 
-def test_an_obstacle_in_numbers_of_wrong_shape():
-    """It is told what is expected, where the contact is first evaluated."""
+def test_sample_of_wrong_shape_is_refused():
+    """The error states the required shape when the contact is first evaluated."""
     given = {"obstacle": Faulty("shape"), "kinematics": "finite"}
     scene = block("triangle", 1)
     words = "Faulty: distance of its sample has shape", "must be"
     raised_everywhere(scene.contact(fc.Frictionless(), **given).evaluate, ValueError, *words)
 
 
-def test_a_file_of_other_data_is_refused(tmp_path):
-    """A history cannot go on on a profile with one more point."""
+def test_checkpoint_of_another_profile_is_refused(tmp_path):
+    """A history cannot be restarted on a profile with one more point."""
     path = shared_folder(tmp_path) / "state.npz"
 
     def made(n):
@@ -338,8 +339,8 @@ def test_a_file_of_other_data_is_refused(tmp_path):
 @pytest.mark.each
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
 @pytest.mark.parametrize("shape", ["ball", "profile", "facets"])
-def test_a_scene_that_moves_and_turns_as_a_whole(cell, shape):
-    """Body and tool moved by any amount, with a history: tractions only turn, 1e-9."""
+def test_tractions_rotate_with_the_whole_scene(cell, shape):
+    """A common rigid motion of body and tool, over a history, only rotates tractions: 1e-9."""
     found = []
     angle_, d = 2.1, 2 if cell == "triangle" else 3
     for moved in (False, True):
@@ -373,14 +374,15 @@ def test_a_scene_that_moves_and_turns_as_a_whole(cell, shape):
 
 
 @pytest.mark.parametrize("law", [fc.Frictionless(1e4), fc.Coulomb(0.2, 1e4, 1e4)])
-def test_small_and_finite_agree_where_displacements_are_small(law):
-    """A spline that fits the domed block: shares of the difference fall as the displacement does.
+def test_small_and_finite_kinematics_agree_at_small_displacements(law):
+    """With a spline that fits the domed block, the relative difference is of first order.
 
-    Four times smaller, four times less; 25 % for the terms of higher order. And small kinematics
-    of the spline are those of its cavity, to the 1e-6 of its normals, as is what the verdict says.
+    Four times smaller displacements have a four times smaller relative difference; 25 % for the
+    terms of higher order. Small kinematics of the spline agree with those of its cavity, to 1e-5 by
+    the 1e-6 of its normals, and so do the small-displacement errors of the verdict, to 1 %.
     """
     t = np.linspace(0.2, np.pi - 0.2, 121)
-    arc = np.column_stack([2 * np.cos(t), 2 * np.sin(t) - 1])[::-1]  # the obstacle is outside
+    arc = np.column_stack([2 * np.cos(t), 2 * np.sin(t) - 1])[::-1]  # obstacle outside the arc
     share, told = [], []
     for size in (4e-3, 1e-3):
         found = []

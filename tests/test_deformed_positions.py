@@ -1,8 +1,8 @@
-"""What happens where the model does not look: at the deformed positions, off the points of Γc.
+"""Penetration and tunnelling at the deformed positions, away from the quadrature points of Γc.
 
-Every scene is a state that the equations of its own kinematics hold in, at a force that is zero or
-far too small; the reference is the geometry: what overlaps, or has passed through, is no solution.
-Held against it are scenes of the same kind in which nothing overlaps.
+The equations of every scene hold within its kinematics, with a contact force that is zero or far
+too small. The reference is the geometry: a state with overlapping bodies, or with a body that has
+passed through another one, must be refused. Similar scenes without overlap must be solved.
 """
 
 import numpy as np
@@ -27,26 +27,26 @@ KINEMATICS = pytest.mark.parametrize("kinematics", ["small", "finite"])
 
 
 def block(low=0.0, bend=None, length=1.0, n=(8, 4)):
-    """A block over [0, length] that stands at a height; its top is held or led."""
+    """Return a block over [0, length] with its underside at a height."""
     axes = [[np.linspace(0.0, length, n[0] + 1), low + np.linspace(0.0, 0.5, n[1] + 1)]]
     sides = {BOTTOM: near(1, low), TOP: near(1, low + 0.5)}
     return Bodies(boxes(axes, sides, bend=bend), E, 0.3)
 
 
 def fails(problem, *words):
-    """The next increment fails, on all ranks, for this reason."""
+    """Assert that the next increment fails on all ranks with these words."""
     raised_everywhere(problem.solve, fc.NotConverged, *words)
 
 
 def plate(half):
-    """A plate about y = 0, of twice that thickness."""
+    """Return a plate about y = 0 of thickness 2 ``half``."""
     return fc.SignedDistance(lambda x: abs(x[1]) - half)
 
 
 @KINEMATICS
 @pytest.mark.parametrize("body_of_ball", [0, 1])
-def test_a_body_that_encloses_its_obstacle_is_refused(body_of_ball, kinematics):
-    """A ball inside of one of two blocks, all of whose boundary is Γc; between them it is taken."""
+def test_obstacle_inside_of_a_body_is_refused(body_of_ball, kinematics):
+    """A ball inside of one of two blocks is refused; between the blocks it is accepted."""
     lines = np.linspace(0.0, 1.0, 5)
     axes = [[lines, lines], [2.0 + lines, lines]]
     around = either(*(near(0, x) for x in (0.0, 1.0, 2.0, 3.0)), near(1, 0.0))
@@ -64,8 +64,8 @@ def test_a_body_that_encloses_its_obstacle_is_refused(body_of_ball, kinematics):
 
 @pytest.mark.parametrize("half", [0.01, 1e-4])
 @pytest.mark.parametrize("steps", [1, 2])
-def test_a_thin_plate_is_not_crossed(half, steps):
-    """Led 1.5 through it, in one increment and in two: neither a point nor a sample is inside."""
+def test_tunnelling_through_a_thin_plate_is_refused(half, steps):
+    """A block moves by 1.5 through a plate in one or two increments; no point ends inside."""
     body = block(low=0.5)
     down = body.constant()
     body.hold(TOP, 0)
@@ -74,12 +74,12 @@ def test_a_thin_plate_is_not_crossed(half, steps):
     problem = body.problem(contact)
     down.value = -1.5 / steps
     fails(problem, "has crossed")
-    down.value = -0.4  # above it still
+    down.value = -0.4  # still above the plate
     assert problem.solve().verdict.failures == []
 
 
-def test_a_thin_plate_is_not_crossed_slowly():
-    """Springs so soft that a point comes to the plate's other side while it is pressed."""
+def test_soft_contact_does_not_tunnel_in_small_increments():
+    """With soft springs a point in contact would reach the other side of the plate."""
     body = block()
     up = body.constant(np.zeros(2))
     body.hold(TOP, 0, 1)
@@ -97,11 +97,11 @@ def test_a_thin_plate_is_not_crossed_slowly():
 
 
 @pytest.mark.parametrize("law", [fc.Frictionless(8000.0), fc.Tresca(0.2, 1.0, 8000.0, 4000.0)])
-def test_a_plate_does_not_change_sides_within_the_resolution(law):
-    """A plate of 2 % of a facet, led towards it by 1.2 % in one increment.
+def test_plate_thinner_than_the_resolution_does_not_change_sides(law):
+    """A plate, 2 % of a facet thick, moves by 1.2 % of a facet in one increment.
 
-    Such a path opens no gap that matters, but the points of Γc come out below the middle of the
-    plate, which draws them down. In increments of 0.4 % it pushes them up, and more every time.
+    The points of Γc end below the middle of the plate, which would push them down: refused. In
+    increments of 0.4 % the force is upward and increases.
     """
     body = block(n=(1, 1))
     up = body.constant(np.zeros(2))
@@ -123,8 +123,8 @@ def test_a_plate_does_not_change_sides_within_the_resolution(law):
 
 
 @KINEMATICS
-def test_a_plate_is_not_crossed_after_a_cut(kinematics):
-    """A trial state that was refused is no start of a path, though its displacement is zero."""
+def test_tunnelling_is_refused_again_after_a_refused_increment(kinematics):
+    """A path starts from the committed state, not from a refused trial state."""
     body = block()
     up = body.constant(np.zeros(2))
     body.hold(TOP, 0, 1)
@@ -140,11 +140,11 @@ def test_a_plate_is_not_crossed_after_a_cut(kinematics):
 
 
 @KINEMATICS
-def test_a_ball_is_not_crossed_where_u_is_found_later(kinematics):
-    """Of the radius 0.2, led by 0.9 until it is all in the block, and then on.
+def test_tunnelling_is_refused_without_recovered_interior_displacement(kinematics):
+    """A ball of radius 0.2 moves by 0.9 until it is entirely inside of the block.
 
-    Where u was left behind the first increment passed without a force, and the next one, of which
-    all is found, began inside.
+    Unless this is verified without the interior displacement, the increment passes without a force
+    and the next one begins inside.
     """
     body = block()
     up = body.constant(np.zeros(2))
@@ -160,7 +160,7 @@ def test_a_ball_is_not_crossed_where_u_is_found_later(kinematics):
 
 
 def ball_below(moved_by, kinematics, radius=0.2, gap=0.03):
-    """A led block, its displacement, and a ball below it that a constant moves: problem and all."""
+    """Return problem, contact, displacement of the block, and constant that moves the ball."""
     body = block(n=(4, 2))
     shift, center = body.constant(np.zeros(2)), body.constant((0.3, -gap - radius))
     lead = body.constant()
@@ -178,22 +178,22 @@ def ball_below(moved_by, kinematics, radius=0.2, gap=0.03):
 @KINEMATICS
 @pytest.mark.parametrize("moved_by", ["center", "distance"])
 @pytest.mark.parametrize("radius", [0.01, 0.2])
-def test_an_obstacle_moved_by_its_constants_does_not_cross(radius, moved_by, kinematics):
-    """All of a ball is in the block at the end, or beyond it; in its own frame Γc does not move.
+def test_tunnelling_of_an_obstacle_moved_by_a_constant_is_refused(radius, moved_by, kinematics):
+    """The ball ends entirely inside of the block or beyond it, without a `displacement`.
 
-    A refused state is not where the next path starts.
+    The next path does not start from the refused state.
     """
     problem, _, _, place = ball_below(moved_by, kinematics, radius)
     start = place.copy()
     for way in (0.47, 0.47, 1.2):
         place[:] = start[0], start[1] + way
         fails(problem, "has crossed")
-    place[:] = start[0] + 0.3, start[1] + 0.02  # below it still
+    place[:] = start[0] + 0.3, start[1] + 0.02  # still below the block
     assert problem.solve().verdict.failures == []
 
 
-def test_a_ball_moved_by_its_center_bears():
-    """As much as one moved by its displacement, to 1e-9: pressed, led aside, and with the block."""
+def test_center_and_displacement_of_a_ball_give_the_same_force():
+    """Pressed, moved sideways, and moved with the block: the forces agree to 1e-9."""
     forces = []
     for moved_by in ("displacement", "center"):
         problem, contact, lead, place = ball_below(moved_by, "finite", gap=0.0)
@@ -210,7 +210,7 @@ def test_a_ball_moved_by_its_center_bears():
 
 
 def refuse_pin(center, radius, ups, kinematics):
-    """A pin that is led up into a held block through these displacements is refused at one."""
+    """Assert that one of these upward displacements of a pin into a block is refused."""
     body = block(n=(4, 2))
     up = body.constant(np.zeros(2))
     body.hold(TOP, 0, 1)
@@ -227,8 +227,8 @@ def refuse_pin(center, radius, ups, kinematics):
 @KINEMATICS
 @pytest.mark.parametrize("at", [0.07, 0.3, 0.55])
 @pytest.mark.parametrize("steps", [1, 2, 4])
-def test_a_pin_does_not_pass_between_places(steps, at, kinematics):
-    """Of the radius 0.01, led 0.6 into facets of 0.25: no place of these is in it at either end."""
+def test_pin_does_not_pass_between_checked_positions(steps, at, kinematics):
+    """A pin of radius 0.01 moves by 0.6 into facets of 0.25; no checked position ends in it."""
     refuse_pin((at, -0.03), 0.01, np.linspace(0.0, 0.6, steps + 1)[1:], kinematics)
 
 
@@ -236,19 +236,19 @@ def test_a_pin_does_not_pass_between_places(steps, at, kinematics):
 @KINEMATICS
 @pytest.mark.parametrize("at", [0.25, 0.3, 0.55])
 @pytest.mark.parametrize("far", [0.03, 0.4])
-def test_a_pin_thinner_than_what_is_allowed_does_not_pass_slowly(far, at, kinematics):
-    """Of the diameter 0.008, into a facet of 0.25, by less than is allowed there; then far."""
+def test_pin_thinner_than_the_allowed_penetration_does_not_pass(far, at, kinematics):
+    """A pin of diameter 0.008 enters a facet of 0.25 by less than allowed, then moves farther."""
     refuse_pin((at, -0.005), 0.004, [0.002, 0.004, 0.006, 0.008, 0.01, 0.012, far], kinematics)
 
 
 @KINEMATICS
 @pytest.mark.parametrize("at", [0.55, 0.6, 0.65])
 @pytest.mark.parametrize("steps", [1, 2, 7])
-def test_a_blade_does_not_pierce_a_facet(steps, at, kinematics):
-    """Upright, 0.02 thick, led 0.3 into facets of 0.25: the way out of it is short aside alone.
+def test_blade_does_not_penetrate_a_facet(steps, at, kinematics):
+    """An upright blade, 0.02 thick, moves by 0.3 into facets of 0.25.
 
-    Where a point is in it its resistance ends, or it is refused as well: no increment in which the
-    tip is deeper than 7 % of a facet passes.
+    The shortest path out of it is sideways, so that it may not resist points inside. No increment
+    passes with the tip deeper than 7 % of a facet.
     """
     body = block(n=(4, 2))
     up = body.constant(np.zeros(2))
@@ -274,10 +274,10 @@ def test_a_blade_does_not_pierce_a_facet(steps, at, kinematics):
 @pytest.mark.each
 @KINEMATICS
 @pytest.mark.parametrize(("at", "aside"), [(0.3, 0.1), (0.35, -0.15), (0.7, -0.15)])
-def test_a_pin_that_moves_aside_is_not_overlooked(kinematics, at, aside):
-    """Of 8 % of a facet, led in by 35 % of it and aside: its place at the end was not pierced.
+def test_pin_that_also_moves_sideways_is_detected(kinematics, at, aside):
+    """A pin of radius 8 % of a facet moves in by 35 % and sideways, away from where it enters.
 
-    It is above Γc at last by more than the 7 % that is allowed, and no point resists.
+    It ends above Γc by more than the allowed 7 %, and no point resists.
     """
     body = block(n=(2, 1))
     move = body.constant(np.zeros(2))
@@ -295,7 +295,7 @@ def test_a_pin_that_moves_aside_is_not_overlooked(kinematics, at, aside):
 
 
 def capsule(center, half, radius):
-    """A plate with round ends along x."""
+    """Return the distance of a plate along x with round ends."""
 
     def distance(x):
         along = x[0] - center[0]
@@ -306,11 +306,11 @@ def capsule(center, half, radius):
 
 
 @pytest.mark.parametrize("half", [0.07, 0.0])
-def test_what_slides_past_a_thin_tip_has_not_crossed_it(half):
-    """A plate of 0.14, and a pin, pressed in by 2 % of a facet and led aside in one increment.
+def test_sliding_past_a_thin_tip_is_not_tunnelling(half):
+    """A plate of length 0.14, or a pin, is pressed in by 2 % of a facet and moved sideways.
 
-    Places of Γc come from one end to the other at less than the radius below the tip. The force is
-    that of three increments, to 1e-6: there is no friction.
+    Points of Γc pass from one end to the other at less than the radius below the tip. Without
+    friction, the force after one increment agrees with that after three to 1e-6.
     """
     forces = []
     for steps in (1, 3):
@@ -332,10 +332,10 @@ def test_what_slides_past_a_thin_tip_has_not_crossed_it(half):
 
 @KINEMATICS
 @pytest.mark.parametrize("sides", [(BOTTOM,), (BOTTOM, SIDES)])
-def test_a_blade_does_not_cut_a_body_off(kinematics, sides):
-    """Upright beside the body, led 1.6 aside: all of it is beside the body again, and nothing cut.
+def test_blade_does_not_pass_sideways_through_a_body(kinematics, sides):
+    """An upright blade moves by 1.6 from one side of the body to the other: refused.
 
-    Also where the flanks, through which it enters and leaves, are not in Γc.
+    The flanks, through which it enters and leaves, need not belong to Γc.
     """
     flanks = {SIDES: lambda x, cell: near(0, 0.0)(x, cell) | near(0, 1.0)(x, cell)}
     axes = [[np.linspace(0.0, 1.0, 9), np.linspace(0.0, 0.5, 5)]]
@@ -355,10 +355,10 @@ def test_a_blade_does_not_cut_a_body_off(kinematics, sides):
     fails(problem, "has crossed")
 
 
-def test_a_bent_facet_is_not_taken_for_crossed():
+def test_bending_of_a_facet_is_not_tunnelling():
     """A ball bends two quadratic facets by half of its radius, in one increment and in five.
 
-    Their chords are crossed by 12 % of their length, they are not: the force is the same to 1e-6.
+    It crosses their chords by 12 % of their length, but not the facets. The forces agree to 1e-6.
     """
     forces = []
     for steps in (1, 5):
@@ -377,8 +377,8 @@ def test_a_bent_facet_is_not_taken_for_crossed():
 
 
 @pytest.mark.parametrize("steps", [1, 4])
-def test_a_blade_is_not_turned_through_a_body(steps):
-    """By one radian: beneath it at first, above at last, and no point was in it at either end."""
+def test_rotation_of_a_blade_through_a_body_is_refused(steps):
+    """The blade turns by 1 rad from below the body to above; no point ends inside of it."""
 
     def blade(x):
         tip, grip = ufl.as_vector((1.5, -0.3)), ufl.as_vector((-1.0, -0.3))
@@ -402,10 +402,11 @@ def test_a_blade_is_not_turned_through_a_body(steps):
 @pytest.mark.each
 @pytest.mark.parametrize("angle", [1.5 * np.pi, 2 * np.pi, -4 * np.pi])
 @pytest.mark.parametrize("length", [1.2, 0.45])
-def test_a_blade_is_not_turned_around_through_a_body(length, angle):
-    """Pivoted 0.5 beside a block on soft springs, in one increment: its place is clear at the end.
+def test_full_turn_of_a_blade_through_a_body_is_refused(length, angle):
+    """The pivot is 0.5 away from a block on soft springs; the blade ends outside of the block.
 
-    The longer blade passes through the block. The shorter one does not reach it: no force.
+    In one increment the longer blade passes through the block. The shorter one does not reach it:
+    no force.
     """
     all_around = either(*(near(i, value) for i in (0, 1) for value in (0.0, 1.0)))
     body = Bodies(boxes([[np.linspace(0.0, 1.0, 5)] * 2], {SIDES: all_around}), E, 0.3)
@@ -427,8 +428,8 @@ def test_a_blade_is_not_turned_around_through_a_body(length, angle):
         assert contact.resultants().normal_force == 0.0
 
 
-def test_a_ball_turns_around_in_place():
-    """Pressed in by 0.005 and turned twice about its centre: without friction nothing changes."""
+def test_rotation_of_a_frictionless_ball_changes_no_force():
+    """A ball is pressed in by 0.005 and turned twice about its centre: same force to 1e-9."""
     body = block()
     body.hold(TOP, 0, 1)
     turned = body.constant()
@@ -447,8 +448,8 @@ def test_a_ball_turns_around_in_place():
 @pytest.mark.each
 @KINEMATICS
 @pytest.mark.parametrize("at", [0.5, 0.53, 0.5625, 0.46])
-def test_a_ball_between_two_points_is_seen(kinematics, at):
-    """A ball of a fifth of a facet, pressed in by more than its diameter at any place of it."""
+def test_ball_between_quadrature_points_is_detected(kinematics, at):
+    """A ball of a fifth of a facet is pressed in by more than its diameter, anywhere on a facet."""
     body = block()
     body.hold(TOP, 0, 1)
     up = body.constant(np.zeros(2))
@@ -464,10 +465,10 @@ def test_a_ball_between_two_points_is_seen(kinematics, at):
 
 
 @pytest.mark.parametrize("kind", ["rests", "hovers"])
-def test_open_points_are_looked_at(kind):
-    """A raised part is driven over a bump, small displacements: its points stay open in the model.
+def test_penetration_of_open_points_is_detected(kind):
+    """With small displacements the points of a raised part stay open when it moves over a bump.
 
-    With finite kinematics the same body is lifted off, or meets the bump.
+    With finite kinematics the body is lifted off, or meets the bump.
     """
 
     def step(x):
@@ -495,8 +496,8 @@ def test_open_points_are_looked_at(kind):
 @pytest.mark.each
 @KINEMATICS
 @pytest.mark.parametrize("way", [0.3, 0.7, 2.5])
-def test_a_body_does_not_enter_another_from_aside(kinematics, way):
-    """A hovering block, whose underside is Γc, is led into a post, or over it and beyond."""
+def test_body_does_not_enter_another_one_sideways(kinematics, way):
+    """A block above a floor, with its underside as Γc, moves into a post, or past it."""
     axes = [
         [np.linspace(0.0, 1.0, 9), 0.3 + np.linspace(0.0, 0.5, 5)],
         [np.linspace(0.0, 3.0, 13), np.linspace(-0.5, 0.0, 3)],
@@ -523,18 +524,18 @@ def test_a_body_does_not_enter_another_from_aside(kinematics, way):
     opposite = fc.DeformableBody(body.tags, (FLOOR, SIDES))
     problem = body.problem(body.contact(BOTTOM, opposite, fc.Frictionless(), kinematics=kinematics))
     along.value = way
-    if way < 0.5:  # short of it
+    if way < 0.5:  # ends before the post
         assert problem.solve().verdict.failures == []
     else:
         fails(problem, "crossed")
 
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
-def test_what_slides_off_the_other_body_does_not_bear(enforcement):
-    """Half off its plate, small displacements: the force of finite kinematics in one increment.
+def test_points_that_slide_off_the_other_body_carry_no_force(enforcement):
+    """A block slides half off its plate: small displacements give the force of finite kinematics.
 
-    As in ten, for it acts between the pairs where an increment ends: 1 % for the displacements,
-    3 % of its thickness, and for multipliers 2 % more, their tolerance.
+    One increment suffices, because contact acts between the pairs at its end. Tolerance 1 % for the
+    displacements, 3 % of the thickness, and for multipliers 2 % more, their tolerance.
     """
     forces = []
     for kinematics, steps in (("finite", 10), ("small", 1), ("small", 10)):
@@ -567,11 +568,12 @@ def test_what_slides_off_the_other_body_does_not_bear(enforcement):
     assert forces[1:] == pytest.approx([forces[0]] * 2, rel=bound)
 
 
-def test_the_end_face_of_a_slab_is_not_taken_for_deep():
-    """A softer block is led over the end of a slab, with its end face tagged or not: one force.
+def test_end_face_of_a_slab_is_not_taken_for_penetration():
+    """A softer block slides over the end of a slab, whose end face is tagged or not.
 
-    The corner of the slab is less deep than the block is pressed by, 0.01, but 0.1 along the end
-    face's normal, which grazes the underside. To 1e-9: no point of Γc meets the end face.
+    The corner of the slab penetrates by less than the 0.01 of the prescribed displacement, but by
+    0.1 along the normal of the end face, which grazes the underside. The forces agree to 1e-9, as
+    no point of Γc meets the end face.
     """
     forces = []
     for tags in ((FLOOR,), (FLOOR, SIDES)):
@@ -605,8 +607,8 @@ def test_the_end_face_of_a_slab_is_not_taken_for_deep():
 
 
 @KINEMATICS
-def test_a_pin_is_seen_beside_what_closes_the_next_facet(kinematics):
-    """A slab holds the facets around up, and a narrow pin enters between the points of one."""
+def test_pin_next_to_closed_facets_is_detected(kinematics):
+    """A slab closes the adjacent facets, and a narrow pin enters between the points of one."""
     width = 0.04
     axes = [
         [np.linspace(0.0, 2.0, 5), np.linspace(0.0, 0.5, 3)],
@@ -631,8 +633,8 @@ def test_a_pin_is_seen_beside_what_closes_the_next_facet(kinematics):
 
 @KINEMATICS
 @pytest.mark.parametrize("both", [False, True])
-def test_crossed_ridges_are_seen(kinematics, both):
-    """Their edges cross, no point of a flank meets the other body: from one side and from both."""
+def test_crossing_ridges_are_detected(kinematics, both):
+    """Ridges cross at their edges, and no point of a flank meets the other body."""
     lines, rise = np.linspace(0.0, 1.0, 5), np.linspace(0.0, 0.5, 3)
 
     def ridges(x):
@@ -668,10 +670,10 @@ def test_crossed_ridges_are_seen(kinematics, both):
     fails(problem, "penetrates")
 
 
-def test_the_undeformed_body_may_be_where_an_obstacle_has_no_normal():
-    """A ball and a block go up together until the ball's centre is where a vertex was at first.
+def test_undeformed_vertex_at_a_singular_distance_is_accepted():
+    """A ball and a block move up until the ball's centre is at an undeformed vertex.
 
-    Reference: the force before, to 1e-9.
+    There the distance has no gradient. Reference: the force before the motion, to 1e-9.
     """
     body = block()
     lead, shift = body.constant(), body.constant((0.0, -0.25))
@@ -692,12 +694,12 @@ def test_the_undeformed_body_may_be_where_an_obstacle_has_no_normal():
 
 
 @pytest.mark.parametrize("tags", [(FLOOR, BOTTOM), (BOTTOM, FLOOR)])
-def test_a_soft_contact_does_not_lose_the_other_body(tags):
-    """Two columns with contact 1e-3 of E/h, which are in each other by most of the load.
+def test_soft_contact_with_large_penetration_keeps_its_pairs(tags):
+    """Two columns with contact stiffness 1e-3 E/h penetrate by most of the prescribed displacement.
 
-    At twice the depth of the last commit normals meet nothing any more: force 0 for 2. Cut to half
-    it is that of springs in series, p = d/(1/k + 2 (1 - ν²)/E), which strains of 1e-3 change by
-    less than 1e-3.
+    At twice the penetration of the last commit the normals find no opposite point, and the force is
+    0 instead of 2: refused. With half the increment the pressure is that of springs in series,
+    d/(1/k + 2 (1 - ν²)/E), to 1e-3, as strains are 1e-3.
     """
     axes = [[np.linspace(0.0, 1.0, 5), y + np.linspace(0.0, 1.0, 5)] for y in (0.0, 1.0)]
     sides = {
@@ -729,8 +731,8 @@ def test_a_soft_contact_does_not_lose_the_other_body(tags):
 
 @KINEMATICS
 @pytest.mark.parametrize("n", [(4, 4), (1, 1)])
-def test_a_block_whose_sides_are_tagged_slides_on_a_floor(n, kinematics):
-    """By a fifth of its width in one increment: its corner enters nothing but the floor.
+def test_block_with_its_sides_in_the_contact_surface_slides(n, kinematics):
+    """A block with sides in Γc slides on a floor by a fifth of its width in one increment.
 
     Reference: friction μ N in full slip, to 1e-9.
     """
@@ -752,10 +754,10 @@ def test_a_block_whose_sides_are_tagged_slides_on_a_floor(n, kinematics):
 
 
 @pytest.mark.parametrize("n", [1, 2])
-def test_a_roller_goes_past_the_end_of_a_block_and_back(n):
-    """Whose bottom and end are tagged, at a depth far below the size of a facet.
+def test_roller_passes_the_end_of_a_block_and_returns(n):
+    """Γc is the bottom and the end of a block; the penetration is far below the facet size.
 
-    Reference: the forces on the way out, to 1e-6: without friction it goes back through them.
+    Without friction the forces of the return agree with those of the outward motion to 1e-6.
     """
     axes = [[np.linspace(0.0, 1.0, n + 1), np.linspace(0.0, 1.0, n + 1)]]
     tags = {BOTTOM: near(1, 0.0), TOP: near(1, 1.0), SIDES: near(0, 1.0)}
@@ -780,11 +782,11 @@ def test_a_roller_goes_past_the_end_of_a_block_and_back(n):
     ("kinematics", "turned"), [("small", 0.0), ("finite", 0.0), ("finite", 2.5)]
 )
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
-def test_nodes_without_points_do_not_pass_through_the_floor(cell, kinematics, turned, caplog):
-    """Vertex quadrature on quadratic elements: their other nodes pass through what is opposite.
+def test_penetration_of_nodes_off_quadrature_points_is_refused(cell, kinematics, turned, caplog):
+    """With vertex quadrature the edge nodes of quadratic elements pass through the floor.
 
-    The points carry no more than linear displacements of a facet: by these nothing is deep, while
-    the middles of edges are below the floor by a tenth of the facet. The floor may have turned.
+    The points resist only displacements that are linear on a facet, and penetrate little, while the
+    midpoints of edges penetrate by a tenth of the facet. The floor may have turned.
     """
     d = dimension(cell)
     mesh, tags = block_mesh(cell, n=1)

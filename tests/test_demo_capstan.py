@@ -17,11 +17,11 @@ pytestmark = [
 OPTIONS = ("--thickness", "1", "0.5", "--cells", "12")
 
 
-def test_tension_of_the_held_end(tmp_path: Path) -> None:
-    """0.3 π of bands 1 and 0.5 thick on a radius of 10: less by 1 to 1.25 t/(2R).
+def test_tension_of_the_fixed_end(tmp_path: Path) -> None:
+    """ln(T2/T1) is 0.3 π, less by 1 to 1.25 t/(2R) for bands 1 and 0.5 thick, R = 10.
 
-    To t = 0 it is extrapolated by a straight line, which leaves the product of both t/R, 0.5 %.
-    All slips long before the end: the last increments change nothing.
+    The linear extrapolation to t = 0 neglects the product of both t/R, 0.5 %. All points slip long
+    before the end: the last increments change nothing.
     """
     result = run_demo("capstan", tmp_path, *OPTIONS)
     found = values(result)
@@ -39,7 +39,7 @@ def test_tension_of_the_held_end(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
-    """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
+    """Two ranks give the same values, to 1e-6: the solver stops at 1e-9 of the forces."""
     options = ("--thickness", "1", "--cells", "12")
     serial = run_demo("capstan", tmp_path / "1", *options)
     parallel = run_demo("capstan", tmp_path / "2", *options, ranks=2)

@@ -1,4 +1,4 @@
-"""The clutch demo, run as its user runs it, against the torque of textbooks for even pressure."""
+"""The clutch demo, run as a script, compared with the textbook torque for uniform pressure."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ pytestmark = [
 
 
 def test_torque_of_full_slip(tmp_path: Path) -> None:
-    """μ F 2/3 (b³ - a³)/(b² - a²) = 0.3 F 15.556 of textbooks; ∫ μ p r dA of the pressure found.
+    """The torque is μ F 2/3 (b³ - a³)/(b² - a²) = 0.3 F 15.556 of textbooks, and ∫ μ p r dA.
 
-    2 %: the ring has 32 sides, and pressures are even to some percent. 1e-6: cos(Δφ/2) for slip
-    that is straight is a part of it. Turning all of the scene as well changes nothing, to 1e-7.
+    2 %: the ring has 32 sides, and pressures vary by some percent. 1e-6: cos(Δφ/2) due to straight
+    slip is a part of it. Rotating the whole scene as well changes nothing, to 1e-7.
     """
     result = run_demo("clutch", tmp_path)
     found, path = values(result), result["path"]
@@ -30,7 +30,7 @@ def test_torque_of_full_slip(tmp_path: Path) -> None:
     assert last["torque"] == pytest.approx(last["held"], rel=1e-6)
     for name in ("force", "torque"):
         assert found[f"{name}, rotating frame, relative change"] < 1e-7
-    # Stick, then some of both, then slip all over, with a torque that grows until then.
+    # Stick, then stick and slip, then slip of all points; the torque grows until then.
     assert path[1]["slip"] == 0 and path[4]["stick"] and path[4]["slip"]
     assert all(row["stick"] == 0 for row in path[5:])
     assert path[2]["torque"] < 0.4 * last["torque"]
@@ -39,6 +39,6 @@ def test_torque_of_full_slip(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_on_two_ranks(tmp_path: Path) -> None:
-    """The demo's own references on two ranks."""
+def test_demo_runs_on_two_ranks(tmp_path: Path) -> None:
+    """The demo, which checks its own references, runs on two ranks."""
     assert run_demo("clutch", tmp_path, ranks=2)["path"][-1]["angle"] == 90.0

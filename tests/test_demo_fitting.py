@@ -1,4 +1,4 @@
-"""The male-female fitting, run as its user runs it, against what holds for every geometry."""
+"""The demo of a male-female fitting is compared with relations that hold for any geometry."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ pytestmark = [
 
 
 def test_statics_and_homogeneity(tmp_path: Path) -> None:
-    """Forces of a wedge under its pull, to 1e-7; a state of degree one in the load, to 1e-8.
+    """Forces are those of a wedge, to 1e-7; the state is homogeneous in the load, to 1e-8.
 
-    P = 0.02656 · 6.4 · 43 daN; the flank climbs 40 mm on 22.
+    P = 0.02656 · 6.4 · 43 daN; the flank rises by 40 mm over 22 mm.
     """
     result = run_demo("fitting", tmp_path)
     found = values(result)
@@ -31,7 +31,7 @@ def test_statics_and_homogeneity(tmp_path: Path) -> None:
     assert found["normal force, μ = 0 [daN]"] == pytest.approx(half / sine, rel=1e-7)
     normal, tangential = result["normal_force"], result["tangential_force"]
     assert half / (sine + 0.2 * cosine) * (1 - 1e-7) <= normal <= half / (sine - 0.2 * cosine)
-    # All of the closed flank slips one way here, so that |T| is the resultant, too.
+    # The closed flank slips in one direction, so that the sum of |τ| is also the resultant.
     assert result["lateral_thrust"] == pytest.approx(normal * cosine - tangential * sine, rel=1e-7)
     assert found["twice the load, relative difference"] <= 1e-8
     assert found["5 increments, relative difference"] <= 1e-8
@@ -40,15 +40,15 @@ def test_statics_and_homogeneity(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_another_geometry(tmp_path: Path) -> None:
-    """Steeper flanks, more friction: the demo's own checks hold (exit code 0)."""
+def test_steeper_flanks_and_more_friction(tmp_path: Path) -> None:
+    """With steeper flanks and more friction the demo's own checks hold (exit code 0)."""
     result = run_demo("fitting", tmp_path, "--f", "60", "--friction", "0.3", "--h", "2")
     assert result["flank_angle_degrees"] == pytest.approx(math.degrees(math.atan2(22, 60)))
 
 
 @pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
-    """The same on two ranks, to 1e-6: the solver stops at 1e-12 of the forces."""
+    """One and two ranks agree to 1e-6; the solver's tolerance is 1e-12 of the forces."""
     serial = run_demo("fitting", tmp_path / "1", "--h", "2")
     parallel = run_demo("fitting", tmp_path / "2", "--h", "2", ranks=2)
     for name in ("normal_force", "tangential_force", "lateral_thrust", "closed_length"):

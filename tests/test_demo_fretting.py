@@ -1,4 +1,4 @@
-"""Fretting of two cylinders, run as its user runs it, against Mindlin's cycle."""
+"""The demo of fretting of two cylinders, run as a script, against Mindlin's cycle."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = [
 
 
 def energy(share: float) -> float:
-    """Eight times chord less curve of δ(q), integrated by rectangles; P = 10, μ = 0.2."""
+    """Return Mindlin's energy: 8 times the area between chord and δ(q); P = 10, μ = 0.2."""
     limit, stiffness = 2.0, math.pi * 200 / (2 * 0.91)
 
     def bend(s: float) -> float:
@@ -28,23 +28,23 @@ def energy(share: float) -> float:
     return 8 * limit * (share * bend(share) / 2 - below)
 
 
-def test_cycle(tmp_path: Path) -> None:
-    """Loop area and work of friction within 1 % of Mindlin's energy; the loop closes.
+def test_fretting_loop_agrees_with_mindlin(tmp_path: Path) -> None:
+    """Loop area within 1 %, dissipation within 0.5 % of Mindlin's energy; the loop closes.
 
-    The trapezoids of eight increments a quarter cut 0.4 % off the area; the work at the points has
-    no such error. On the way back slip starts anew, from nothing, as on the way there.
+    The trapezoidal rule with eight increments per quarter loses 0.4 % of the area; the dissipation
+    at the points has no such error. After a load reversal slip starts from zero again.
     """
     result = run_demo("fretting", tmp_path)
     found = values(result)
     assert found["loop area [mJ/mm]"] == pytest.approx(energy(0.7), rel=0.01)
     assert found["dissipated energy [mJ/mm]"] == pytest.approx(energy(0.7), rel=0.005)
     assert found["closing error of the loop / width"] <= 1e-4
-    # Traction of the turn less twice that of half the force, in the centre: p₀ = 9.3514.
+    # Traction in the centre at the reversal, less twice that of half the force: p₀ = 9.3514.
     centre = 0.2 * 9.3514 * ((1 - math.sqrt(0.3)) - 2 * (1 - math.sqrt(0.65)))
     assert found["residual shear traction at q = 0, centre [MPa]"] == pytest.approx(
         centre, rel=0.03
     )
-    # Where the load is reversed all points stick, and Newton's method starts from the last state.
+    # At a load reversal all points stick, and Newton's method starts from the last state.
     # Measured: 3 and 2 iterations; 67 and 67 if a step on the last tangent is the predictor.
     rows = result["rows"]
     assert rows[9]["force"] < rows[8]["force"] and rows[25]["force"] > rows[24]["force"]
@@ -56,7 +56,7 @@ def test_cycle(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
-    """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
+    """Two ranks give the results of one to 1e-6; the residual is at most 1e-9 of the forces."""
     options = ("--cells", "16", "--increments", "5")
     serial = run_demo("fretting", tmp_path / "1", *options)
     parallel = run_demo("fretting", tmp_path / "2", *options, ranks=2)

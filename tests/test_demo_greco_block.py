@@ -1,4 +1,4 @@
-"""The GRECO block, run as its user runs it, against the converged solution."""
+"""The demo of the GRECO block, run as a script, against the converged solution."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ pytestmark = [
 
 
 def test_displacements_forces_and_zones(tmp_path: Path) -> None:
-    """u_x within 0.3 % of the converged values; N = 2000 by equilibrium, T within 0.3 %."""
+    """u_x and T agree with converged values to 0.3 %, and N with equilibrium, 2000, to 1e-8."""
     result = run_demo("greco_block", tmp_path)
     converged = [28.603, 27.226, 22.868, 19.807, 15.414]
     assert result["displacements_um"] == pytest.approx(converged, rel=0.003)
     assert result["normal_force"] == pytest.approx(2000.0, rel=1e-8)
     assert result["tangential_force"] == pytest.approx(1405.36, rel=0.003)
     zones = result["zones_mm"]
-    # The spacing of the points is 0.2 mm at the lift-off and 0.6 mm at the end of the slip.
+    # The points are 0.2 mm apart at the end of the open zone and 0.6 mm at the end of slip.
     assert zones["open"][1] == pytest.approx(3.3, abs=0.3)
     assert zones["slip"] == pytest.approx([3.4, 29.8], abs=0.6)
     assert zones["stick"][0] == pytest.approx(29.8, abs=0.6)
@@ -32,10 +32,10 @@ def test_displacements_forces_and_zones(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_increments_do_not_matter(tmp_path: Path) -> None:
-    """Zero gap and a proportional load: ten increments give the state of one, to the solver's 1e-9.
+def test_result_does_not_depend_on_the_number_of_increments(tmp_path: Path) -> None:
+    """With zero gap and a proportional load one and ten increments give the same state, to 1e-7.
 
-    Residuals of 1e-9 of the forces are displacements of some 1e-8.
+    Residuals of 1e-9 of the forces cause errors of some 1e-8 in the displacements.
     """
     once = run_demo("greco_block", tmp_path / "1", "--cells", "20")
     often = run_demo("greco_block", tmp_path / "10", "--cells", "20", "--increments", "10")
@@ -45,7 +45,7 @@ def test_increments_do_not_matter(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
-    """The same on two ranks, to 1e-7 for the same reason."""
+    """Two ranks give the displacements of one to 1e-7, for residuals of 1e-9 of the forces."""
     serial = run_demo("greco_block", tmp_path / "1", "--cells", "20")
     parallel = run_demo("greco_block", tmp_path / "2", "--cells", "20", ranks=2)
     assert parallel["displacements_um"] == pytest.approx(serial["displacements_um"], rel=1e-7)

@@ -1,4 +1,4 @@
-"""The half-cylinder demo, run as its user runs it, against its references."""
+"""The half-cylinder demo, run from the command line, agrees with its references."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ FIGURES = (
 
 @pytest.fixture(scope="module")
 def paper(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
-    """Result and folder of the plain command."""
+    """Run the command without options and return its result and folder."""
     folder = tmp_path_factory.mktemp("paper")
     return run(folder), folder
 
 
-def test_paper_mesh_writes_everything(paper: tuple[dict[str, Any], Path]) -> None:
-    """The plain command: the paper's method, both frictions, pictures, files, documented keys."""
+def test_default_command_writes_all_results(paper: tuple[dict[str, Any], Path]) -> None:
+    """The defaults are the paper's method and both frictions; all files and keys exist."""
     result, written = paper
     keys = "iterations converged_reasons solve_seconds wall_seconds dofs references".split()
     keys += FIGURES
@@ -54,10 +54,10 @@ def test_paper_mesh_writes_everything(paper: tuple[dict[str, Any], Path]) -> Non
             assert (folder / f"{name}.pvd").exists()
 
 
-def test_by_the_own_choice(tmp_path: Path, paper: tuple[dict[str, Any], Path]) -> None:
-    """``--solver auto``, both frictions: the same figures, in fewer iterations.
+def test_auto_solver_saves_iterations(tmp_path: Path, paper: tuple[dict[str, Any], Path]) -> None:
+    """``--solver auto`` yields the same results to 1e-6 in fewer iterations than L-BFGS.
 
-    Newton's method and continuation are preferred for that: else L-BFGS would do alone.
+    This is why Newton's method and continuation are preferred to L-BFGS.
     """
     result = run(tmp_path, "--solver", "auto")
     for case, same in zip(result["runs"], paper[0]["runs"], strict=True):
@@ -70,8 +70,8 @@ def test_by_the_own_choice(tmp_path: Path, paper: tuple[dict[str, Any], Path]) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("solver", ["newton", "continuation", "alternating"])
-def test_other_solvers(tmp_path: Path, solver: str) -> None:
-    """They find the state that the paper's method finds, and are what the result says."""
+def test_solvers_agree(tmp_path: Path, solver: str) -> None:
+    """Results agree with the paper's method to 1e-6, and name the chosen solver."""
     options = ("--friction", "0.2", "--increments", "5")
     paper = run(tmp_path / "lbfgs", *options)
     result = run(tmp_path / solver, *options, "--solver", solver)
@@ -81,17 +81,17 @@ def test_other_solvers(tmp_path: Path, solver: str) -> None:
 
 
 def test_frictionless_against_exact_contact(tmp_path: Path) -> None:
-    """Within 1 % of the converged solution with exact complementarity (a = 2.127, p0 = 142.6)."""
+    """Reference with exact complementarity, converged: a = 2.127, p₀ = 142.6, within 1 %."""
     result = run(tmp_path, "--h", "0.05", "--degree", "2", "--friction", "0")
     assert result["half_width"] == pytest.approx(2.127, rel=0.01)
     assert result["peak_pressure"] == pytest.approx(142.6, rel=0.01)
-    # Displacements converge twice as fast as tractions: the digits the reference has.
+    # Displacements converge twice as fast as tractions, so the tolerances are smaller.
     assert result["top_centre_displacement"][1] == pytest.approx(-0.5181, rel=1e-3)
     assert result["top_corner_displacement"] == pytest.approx([0.3332, -0.9947], rel=2e-3)
 
 
 def test_friction_against_exact_contact(tmp_path: Path) -> None:
-    """Within 2 % of the incremental solution with exact complementarity; its stick zone, too."""
+    """The incremental solution with exact complementarity and its stick zone agree to 2 %."""
     result = run(
         tmp_path, "--h", "0.05", "--degree", "2", "--friction", "0.2", "--increments", "80"
     )
@@ -101,17 +101,17 @@ def test_friction_against_exact_contact(tmp_path: Path) -> None:
     assert result["stick_half_width"] == pytest.approx(0.737 * 2.0855, rel=0.02)
 
 
-def test_one_increment_is_another_history(tmp_path: Path) -> None:
-    """The load in one increment: T = 38.99 and a stick zone of 0.23 a, 14 % from the history."""
+def test_one_increment_yields_a_different_stick_zone(tmp_path: Path) -> None:
+    """One increment yields T = 38.99, 14 % from the history, and a stick zone of 0.23 a."""
     result = run(tmp_path, "--h", "0.1", "--degree", "2", "--friction", "0.2", "--increments", "1")
     assert result["tangential_resultant"] == pytest.approx(38.99, rel=0.01)
     assert result["max_tangential_traction"] == pytest.approx(29.3, rel=0.02)
-    # 0.23 is given with two digits; half the spacing of the points is 0.017 mm.
+    # The reference 0.23 has two digits; half of the point spacing is 0.017 mm.
     assert result["stick_half_width"] / result["half_width"] == pytest.approx(0.23, abs=0.015)
 
 
-def test_thin_contact_is_hertz(tmp_path: Path) -> None:
-    """a/R = 0.048: Hertz's own half-width and peak pressure within 1 %."""
+def test_narrow_contact_agrees_with_hertz(tmp_path: Path) -> None:
+    """For a/R = 0.048 half-width and peak pressure agree with Hertz within 1 %."""
     result = run(tmp_path, "--load", "1", "--h", "0.02", "--degree", "2", "--friction", "0")
     reference = {k: v["value"] for k, v in result["references"].items()}
     assert reference["half_width"] / 8 < 0.05
@@ -120,8 +120,8 @@ def test_thin_contact_is_hertz(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_pressure_error_falls_with_h(tmp_path: Path) -> None:
-    """The convergence run prints a rate; a pressure that ends like a square root allows 1."""
+def test_pressure_error_decreases_with_h(tmp_path: Path) -> None:
+    """The fitted rate is 1 ± 0.3; the square-root edge of the pressure limits it to 1."""
     study = run(tmp_path, "--convergence", "--degree", "2")
     assert "fitted rate" in study["stdout"]
     errors = [row["pressure_error"] for row in study["rows"]]
@@ -131,7 +131,7 @@ def test_pressure_error_falls_with_h(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ranks", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_ranks_agree(tmp_path: Path, ranks: int) -> None:
-    """The same numbers to 1e-6 on 2 and 3 ranks."""
+    """Results on 2 and 3 ranks agree with those on one rank to 1e-6."""
     options = ("--h", "0.4", "--degree", "2", "--friction", "0.2", "--increments", "2")
     serial = run(tmp_path / "serial", *options)
     parallel = run(tmp_path / "parallel", *options, ranks=ranks)

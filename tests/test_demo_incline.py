@@ -1,4 +1,4 @@
-"""The block on an incline, run as its user runs it, against statics."""
+"""The demo of a block on an incline is compared with statics."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ pytestmark = [
 
 
 def test_friction_angle_and_wedge(tmp_path: Path) -> None:
-    """Refused where tan α = μ, to the 1e-4 it is searched; F/G of NAFEMS CGS-4 to all its digits.
+    """The limit slope is tan α = μ, to 1e-4; F/G of NAFEMS CGS-4 is reproduced to all its digits.
 
-    Statics decides both, whatever the mesh. On the way up part of the base slips, more and more.
+    Both follow from statics on any mesh. While the slope grows, the slip part of the base grows.
     """
     result = run_demo("incline", tmp_path)
     assert result["tilted"]["limit"] == pytest.approx(0.3, rel=1e-4)
@@ -29,14 +29,14 @@ def test_friction_angle_and_wedge(tmp_path: Path) -> None:
     assert "no contact force can balance" in result["tilted"]["message"]
     wedge = [run["rows"][-1]["F/G"] for run in result["pushed"]]
     assert wedge == pytest.approx([0.1, 0.202020, 0.306122, 0.412371], abs=5e-7)
-    assert result["pushed"][-1]["rows"][1]["F/G"] < 0.3  # it sticks before it slides
+    assert result["pushed"][-1]["rows"][1]["F/G"] < 0.3  # the block sticks before it slides
     for name in ("forces", "mesh"):
         assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
 
 @pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
-    """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
+    """One and two ranks agree to 1e-6; the solver's tolerance is 1e-9 of the forces."""
     options = ("--cells", "18", "--increments", "2")
     serial = run_demo("incline", tmp_path / "1", *options)
     parallel = run_demo("incline", tmp_path / "2", *options, ranks=2)

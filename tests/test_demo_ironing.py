@@ -1,4 +1,4 @@
-"""The ironing demo, run as its user runs it, against the sliding cylinder on a half-plane."""
+"""The ironing demo agrees with the solution of a sliding cylinder on a half-plane."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ OPTIONS = ("--cells", "6", "--increments", "12")
 
 
 @pytest.mark.slow
-def test_sliding(tmp_path: Path) -> None:
-    """Half-width and peak of Johnson's solution, numbers put in: 2 %, six cells per half-width.
+def test_sliding_cylinder_agrees_with_johnson(tmp_path: Path) -> None:
+    """Half-width and peak pressure agree with Johnson to 2 %, six cells per half-width.
 
-    γ = 0.0272: a = 0.2505, p₀ = 11.445; without friction they would be 0.2501 and 11.45. The
-    vertical force is the one given, though the height of the cylinder is not.
+    For γ = 0.0272, a = 0.2505 and p₀ = 11.445; without friction 0.2501 and 11.45. The vertical
+    force is prescribed, and the height of the cylinder unknown.
     """
     result = run_demo("ironing", tmp_path, *OPTIONS)
     found = values(result)
@@ -38,7 +38,7 @@ def test_sliding(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
-    """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
+    """Results on two ranks agree to 1e-6; the solver stops at 1e-9 of the forces."""
     options = ("--cells", "5", "--increments", "4")
     serial = run_demo("ironing", tmp_path / "1", *options)
     parallel = run_demo("ironing", tmp_path / "2", *options, ranks=2)

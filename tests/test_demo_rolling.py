@@ -1,4 +1,4 @@
-"""The rolling demo, run as its user runs it, against GetFEM and by a cross-check."""
+"""The rolling demo, run as users run it, against GetFEM and by a cross-check."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ pytestmark = [
 
 @pytest.mark.slow  # the same scene, numbers and digits: test_finite_references.py
 def test_forces_and_torque(tmp_path: Path) -> None:
-    """GetFEM's at the end of pressing, turning and dragging; the disc slips before it is dragged.
+    """Forces and torque are GetFEM's after pressing, rotation and dragging, to 1e-6.
 
-    1e-6 here, where numbers of 3 to 4 thousand stand with six digits behind the point.
+    The references have six decimals. The disc slips before it is dragged.
     """
     result = run_demo("rolling", tmp_path)
     found = values(result)
@@ -35,6 +35,6 @@ def test_forces_and_torque(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_on_two_ranks(tmp_path: Path) -> None:
-    """The demo's own references on two ranks."""
+def test_demo_on_two_ranks(tmp_path: Path) -> None:
+    """The demo finishes on two ranks, where it checks its own references."""
     assert run_demo("rolling", tmp_path, ranks=2)["path"][-1]["time"] == pytest.approx(3.0)

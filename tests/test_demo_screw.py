@@ -1,4 +1,4 @@
-"""The screw demo, run as its user runs it, against textbooks' torque of a square thread."""
+"""The screw demo agrees with the textbook torque of a square thread."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ pytestmark = [
 
 
 def test_torque_over_axial_force(tmp_path: Path) -> None:
-    """F P without friction, which all points meet by their normals; F R tan(α ± φ) with μ = 0.2.
+    """The torque is F P without friction, and F R tan(α ± φ) with μ = 0.2.
 
-    To round-off, and to 3e-4 of F R: pressures whose middle is by a hundredth of the width off that
-    of the block change friction's part, μ = 0.2, by a thousandth.
+    The first follows from the normals at all points, to round-off (1e-9). The second holds to 3e-4
+    of F R: a centre of pressure off the middle by a hundredth of the width of the block changes the
+    contribution of friction by a thousandth.
     """
     result = run_demo("screw", tmp_path, "--friction", "0.2", "--cells", "3")
     found = values(result)

@@ -16,8 +16,11 @@ pytestmark = [
 
 
 @pytest.mark.slow
-def test_pressed_and_begun_to_slide(tmp_path: Path) -> None:
-    """V(1) between the published ones; all points slip soon, at up to 8 steps an increment."""
+def test_pressing_and_first_sliding(tmp_path: Path) -> None:
+    """V(1) is in the published range, and all points slip soon afterwards.
+
+    Sliding takes at most 8 iterations per increment on average.
+    """
     options = ("--increments", "250", "--until", "1.06")
     result = run_demo("shallow_ironing", tmp_path, *options)
     assert 268.0 < values(result)["V, t = 1"] < 332.0
@@ -29,8 +32,8 @@ def test_pressed_and_begun_to_slide(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_dragged_by_four_times_the_die(tmp_path: Path) -> None:
-    """V(1.5) and H(1.5) between the published ones, too."""
+def test_dragging_by_four_times_the_die(tmp_path: Path) -> None:
+    """V(1.5) and H(1.5) are in the published ranges."""
     found = values(run_demo("shallow_ironing", tmp_path, "--until", "1.5"))
     assert 337.0 < found["V, t = 1.5"] < 421.0
     assert 102.0 < found["H, t = 1.5"] < 189.0

@@ -1,4 +1,4 @@
-"""The shrink fit, run as its user runs it, against Lamé's rings."""
+"""The shrink-fit demo against Lamé's solution for rings."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ pytestmark = [
 PRESSURE = "pressure [MPa]"
 
 
-def test_lame(tmp_path: Path) -> None:
-    """63.000 MPa in plane stress, 69.231 in plane strain: within 0.1 %, where 0.5 % is claimed.
+def test_pressure_agrees_with_lame(tmp_path: Path) -> None:
+    """Pressures are within 0.1 % of 63.000 MPa in plane stress and 69.231 MPa in plane strain.
 
-    The penalty of 100 E/h takes h/100 of some 60 mm off the stiffness: 0.01 %; the cells of 1 mm
-    add as much.
+    The demo claims 0.5 %. The penalty of 100 E/h adds h/100 to a compliance of some 60 mm, which is
+    0.01 %; the error due to the cells of 1 mm is as large.
     """
     result = run_demo("shrink_fit", tmp_path)
     stress, strain = result["runs"]
@@ -38,7 +38,7 @@ def test_lame(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
-    """The same on two ranks, to 1e-6 (the unevenness, a difference, to 1e-8 of the pressure)."""
+    """Two ranks agree with one to 1e-6 (the unevenness, a difference, to 1e-8 of the pressure)."""
     options = ("--kinds", "plane strain")
     (serial,) = run_demo("shrink_fit", tmp_path / "1", *options)["runs"]
     (parallel,) = run_demo("shrink_fit", tmp_path / "2", *options, ranks=2)["runs"]

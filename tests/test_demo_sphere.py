@@ -1,4 +1,4 @@
-"""Balls in contact, run as their user runs them, against Hertz."""
+"""The sphere demo, run as users run it, against Hertz."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ pytestmark = [
 ]
 
 
-def test_hertz(tmp_path: Path) -> None:
-    """Force, radius and peak within 2 % of Hertz, a/R = 0.007; his formulas with numbers put in.
+def test_force_radius_and_peak_pressure_of_hertz(tmp_path: Path) -> None:
+    """Force, radius and peak pressure are within 2 % of Hertz's formulas, at a/R = 0.007.
 
-    d = 5e-5: a = 0.00707107, F = 0.108786, p₀ = 1038.83. Next to nothing stems from a/R; springs of
-    30 E/h and eight cells per radius make half a per cent.
+    d = 5e-5: a = 0.00707107, F = 0.108786, p₀ = 1038.83. The error due to a/R is negligible; a
+    stiffness of 30 E/h and eight cells per radius cause half a per cent.
     """
     result = run_demo("sphere", tmp_path)
     block, ball = result["runs"]
@@ -37,7 +37,7 @@ def test_hertz(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
-    """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
+    """Results on two ranks agree to 1e-6; the solver's tolerance is 1e-9 of the forces."""
     options = ("--cases", "ball", "--cells", "6")
     serial = run_demo("sphere", tmp_path / "1", *options)
     parallel = run_demo("sphere", tmp_path / "2", *options, ranks=2)

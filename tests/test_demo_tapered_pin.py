@@ -1,4 +1,4 @@
-"""The tapered pin, run as its user runs it, against Lamé's rings and Coulomb's cone."""
+"""The tapered pin demo, run from the command line, against Lamé's rings and Coulomb's law."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ pytestmark = [
 
 
 @pytest.mark.slow
-def test_pushed_in_released_and_pulled_out(tmp_path: Path) -> None:
-    """205.4 MPa between pin and hub, Q = 514 kN: 82.6 kN in and, dry, 71.2 kN out.
+def test_insertion_release_and_extraction(tmp_path: Path) -> None:
+    """Pressure 205.4 MPa (Q = 514 kN); insertion 82.6 kN and dry extraction 71.2 kN, to 0.5 %.
 
-    0.5 %, as the demo says. Dry the pin stays, with oil it comes out; the push that holds it is
-    (0.01 - 0.005) / (0.01 + 0.005) of the first, and at half of that half of the way is left (2 %:
-    a bare end is a fortieth of the joint).
+    After release the dry pin keeps its depth, and the lubricated one comes out. Its holding force
+    is (0.01 - 0.005) / (0.01 + 0.005) of the insertion force; at half of it half of the depth
+    remains, to 2 % (the end of the pin outside of the hub is a fortieth of the joint).
     """
     result = run_demo("tapered_pin", tmp_path, "--cells", "20")
     found = values(result)
@@ -35,7 +35,7 @@ def test_pushed_in_released_and_pulled_out(tmp_path: Path) -> None:
     )
     assert found["lubricated: relative depth after release"] == pytest.approx(0.0, abs=1e-6)
     dry, _, oiled = result["paths"]
-    # Dry the force changes its sign at once; with oil it stays a push all the way out.
+    # The dry force changes its sign at the reversal; the lubricated one never does.
     (turned,) = [i for i, (s, _, _) in enumerate(dry) if abs(s - 2.0) < 1e-9]
     assert all(push > 0 for _, _, push in dry[: turned + 1])
     assert all(push < 0 for s, _, push in dry[turned:] if 0 < s < 1.98)
@@ -45,7 +45,7 @@ def test_pushed_in_released_and_pulled_out(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
-    """The same on two ranks, to 1e-6 (what is zero to 1e-6, too): the solver stops at 1e-9."""
+    """Results on two ranks agree to 1e-6, relative or absolute; the solver's tolerance is 1e-9."""
     serial = run_demo("tapered_pin", tmp_path / "1", "--cells", "20")
     parallel = run_demo("tapered_pin", tmp_path / "2", "--cells", "20", ranks=2)
     assert values(parallel) == pytest.approx(values(serial), rel=1e-6, abs=1e-6)

@@ -1,4 +1,4 @@
-"""The tube demo, run as its user runs it, against a quarter on a rigid plane and Winkler's beam."""
+"""The tube demo, run as a script, compared with a quarter on a rigid plane and Winkler's beam."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ pytestmark = [
 ]
 
 
-def test_forces_before_and_after_it_closes(tmp_path: Path) -> None:
-    """Winkler's beam at the first pinch; a quarter on a rigid plane once the walls bear.
+def test_forces_before_and_after_the_tube_closes(tmp_path: Path) -> None:
+    """Forces are those of Winkler's beam, and of a quarter on a rigid plane after closing.
 
-    1.5 %: half of (t/R)², as sections do not stay plane; 1e-3 between the routes: normals of walls
-    that are not flat do not end at mirror images. Without contact the walls would pass through each
-    other under the force of before, a twelfth of the last.
+    1.5 %: half of (t/R)², as sections do not stay plane; 1e-3 between tube and quarter: normals of
+    walls that are not flat do not end at mirror images. Without contact the walls would pass
+    through each other under the force at closing, a twelfth of the last.
     """
     result = run_demo("tube", tmp_path)
     found = values(result)
@@ -31,7 +31,7 @@ def test_forces_before_and_after_it_closes(tmp_path: Path) -> None:
     closing, inside = result["closing"], result["inside"]["tube"]
     assert [f > 0 for f in inside] == [c > 18 for c in closing]
     assert whole[-1] > 10 * whole[closing.index(18)]
-    # What is left is borne by the bent loops, a little more than when it closed.
+    # The bent loops carry the rest, slightly more than at closing.
     loops = whole[-1] - inside[-1]
     assert whole[closing.index(18)] < loops < 1.2 * whole[closing.index(18)]
     for name in ("tube.png", "section.png"):
@@ -40,7 +40,7 @@ def test_forces_before_and_after_it_closes(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_two_ranks_agree(tmp_path: Path) -> None:
-    """The same on two ranks, to 1e-6: the solver stops at 1e-9 of the forces."""
+    """Results on two ranks agree to 1e-6: the solver's tolerance is 1e-9 of the forces."""
     serial = run_demo("tube", tmp_path / "1")
     parallel = run_demo("tube", tmp_path / "2", ranks=2)
     for name, value in values(serial).items():

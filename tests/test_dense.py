@@ -1,4 +1,4 @@
-"""The dense solver of condensed problems against LU of the whole, by numpy."""
+"""The dense solver of condensed problems against numpy's LU factors of the whole matrix."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ N = 40
 
 
 def scene(symmetric, seed=1):
-    """S, well conditioned, and the solver behind a KSP."""
+    """Return the generator, a well-conditioned S, the matrix, and the solver as a KSP."""
     rng = np.random.default_rng(seed)
     fixed = rng.normal(size=(N, N)) / N
     if symmetric:
@@ -33,7 +33,10 @@ def scene(symmetric, seed=1):
 
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_solutions(symmetric):
-    """A contact that grows, shrinks, leaves and covers all; then another S. 1e-12 by condition."""
+    """Solutions agree to 1e-12 as contact grows, shrinks, vanishes and covers all, for two S.
+
+    The matrices are well-conditioned.
+    """
     rng, fixed, matrix, ksp, operator = scene(symmetric)
     for fixed_now in (fixed, fixed + 0.5 * np.eye(N)):
         for n in (3, 4, 9, 20, N - 2, 5, 0, 12):
@@ -42,7 +45,7 @@ def test_solutions(symmetric):
             added = rng.normal(size=n * n) / N
             whole[rows, columns] += added
             operator.set_parts(fixed_now, rows, columns, added)
-            matrix.assemble()  # says that it changed
+            matrix.assemble()  # marks it as changed
             right = rng.normal(size=N)
             b, x = (PETSc.Vec().createSeq(N) for _ in range(2))
             b.array[:] = right
@@ -51,11 +54,11 @@ def test_solutions(symmetric):
 
 
 @pytest.mark.parametrize("size", [1.0, 1e8])
-def test_few_changes_are_corrections(size, monkeypatch):
-    """Points that close and open one by one, soft and stiff, against LU of the whole to 1e-9.
+def test_few_changes_update_the_factors(size, monkeypatch):
+    """Solutions agree to 1e-9 as soft or stiff points close and open one by one.
 
-    Soft ones take no new factorisation while few unknowns have changed, and one where many have;
-    where stiff ones spoil the correction a look at the residual asks for one.
+    Soft points cause no new factorisation while few dofs have changed, and one if many have. If
+    stiff points spoil the update, the residual triggers one.
     """
     rng, fixed, matrix, ksp, operator = scene(True)
     made = []
@@ -82,8 +85,8 @@ def test_few_changes_are_corrections(size, monkeypatch):
         assert counts[-2] > counts[-3]
 
 
-def test_the_operator_multiplies():
-    """S x + C x, and the transposed, by numpy to round-off."""
+def test_operator_products():
+    """S x + C x and the transposed product agree with numpy to round-off."""
     rng, fixed, matrix, _, operator = scene(False)
     values = rng.normal(size=3)
     operator.set_parts(fixed, np.array([1, 1, 7]), np.array([2, 1, 0]), values)
@@ -97,8 +100,8 @@ def test_the_operator_multiplies():
     assert np.allclose(y.array, whole.T @ x.array, rtol=0, atol=1e-13)
 
 
-def test_a_zero_pivot_is_said():
-    """As a diverged solution, which SNES understands, and once only."""
+def test_zero_pivot_is_reported():
+    """A zero pivot is reported once only, as a diverged solution, which SNES understands."""
     _, fixed, matrix, ksp, operator = scene(True)
     every = np.indices((N, N)).reshape(2, -1)
     operator.set_parts(fixed, *every, -fixed.ravel())

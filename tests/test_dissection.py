@@ -1,4 +1,4 @@
-"""Elimination by substructures, against dense algebra: numpy, to 1e-10 of the largest entry."""
+"""Nested dissection agrees with dense algebra to 1e-10 of the largest entry."""
 
 import numpy as np
 import pytest
@@ -12,10 +12,10 @@ pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="every rank does
 
 
 def lattice(n, d, *, symmetric=True, shift=0.0):
-    """Springs between the nodes of a grid and their neighbours, with ``d`` components each.
+    """Create springs between adjacent nodes of a grid, with ``d`` components each.
 
     Returns:
-        The stiffness, dense, and the places of its unknowns.
+        The dense stiffness and the coordinates of its dofs.
     """
     grid = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     distance = np.abs(grid[:, None] - grid[None]).max(axis=2)
@@ -47,10 +47,10 @@ def sparse(K):
     [(True, 0.0), (False, 0.0), (True, 9.0)],
     ids=["", "unsymmetric", "not definite"],
 )
-def test_dissection(symmetric, shift, inner):
-    """Schur complement, and displacements under forces and with the boundary moved.
+def test_dissection_agrees_with_dense_algebra(symmetric, shift, inner):
+    """Schur complement and displacements under forces and boundary displacements agree.
 
-    In one substructure, in a few, and in more than there are nodes between them.
+    There are one, a few, or very many substructures.
     """
     K, places = lattice(5, 2, symmetric=symmetric, shift=shift)
     n = len(K)
@@ -74,8 +74,8 @@ def test_dissection(symmetric, shift, inner):
         assert close(made.back_substitute(given, made.eliminate(load)), expected, 1e-10)
 
 
-def test_a_part_that_nothing_holds_is_refused():
-    """What is eliminated is singular: numbers that are none do not come out."""
+def test_singular_block_is_refused():
+    """A singular block to be eliminated raises instead of yielding NaN."""
     matrix = np.zeros((3, 3), order="F")
     matrix[2, 2] = 1.0
     with pytest.raises(RuntimeError, match="singular"):

@@ -1,4 +1,4 @@
-"""Where `docker/run` runs a command, and what it refuses before it does anything, in words."""
+"""Where `docker/run` runs a command, and which environments it refuses with a message."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = [
 
 RUN = ROOT / "docker" / "run"
 
-# Notes what it is asked for.
+# Records its arguments.
 DOCKER = """#!/bin/sh
 echo "$@" >>"${0%/*}/asked"
 [ "$1" != info ] || echo 99
@@ -28,9 +28,9 @@ echo "$@" >>"${0%/*}/asked"
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Call docker/run in a given environment, with an engine that has every image, or none.
+    """Return a function that calls docker/run with an engine that has every image, or none.
 
-    Gives the process, and what it asked that engine for, line by line.
+    The function returns the process, and the lines of its requests to that engine.
     """
     engine = tmp_path / "docker"
     engine.write_text(DOCKER)
@@ -52,14 +52,14 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     return call
 
 
-def test_a_command_runs_here_where_dolfinx_is(run) -> None:
-    """As it is where the tests run: its own output, and no engine is asked for anything."""
+def test_command_runs_locally_if_dolfinx_is_installed(run) -> None:
+    """Where DOLFINx is installed the command runs locally, without a request to the engine."""
     process, asked = run()
     assert (process.returncode, process.stdout, asked) == (0, "here\n", [])
 
 
-def test_more_ranks_than_cores_start_without_a_word() -> None:
-    """Neither refused, nor with a warning of old names: all that is printed is what they print."""
+def test_more_ranks_than_cores_start_without_warnings() -> None:
+    """More ranks than cores start, and print nothing but their own output."""
     ranks = (os.cpu_count() or 1) + 1
     words = command(ranks, "-c", "print('here')")
     process = subprocess.run(words, env=environment(), capture_output=True, text=True, timeout=60)
@@ -68,13 +68,13 @@ def test_more_ranks_than_cores_start_without_a_word() -> None:
 
 @pytest.mark.whole
 @pytest.mark.parametrize("suite", ["Debian 13", "../unstable", "-x"])
-def test_what_is_no_suite_is_refused(run, suite: str) -> None:
+def test_bad_suite_is_refused(run, suite: str) -> None:
     process, asked = run(FENICS_CONTACT_SUITE=suite)
     assert process.returncode == 1 and asked == []
     assert f"FENICS_CONTACT_SUITE is '{suite}'; it must be a suite of Debian" in process.stderr
 
 
-def test_a_suite_and_an_image_at_once_are_refused(run) -> None:
+def test_suite_together_with_an_image_is_refused(run) -> None:
     process, asked = run(FENICS_CONTACT_SUITE="unstable", FENICS_CONTACT_BASE="debian:trixie")
     assert process.returncode == 1 and asked == []
     assert "both say what to start from: unset one" in process.stderr

@@ -1,4 +1,4 @@
-"""The pages of docs/, as far as it takes no Sphinx: nothing is missing, and what they show runs."""
+"""The pages of docs/ are complete and their scripts run; checked without Sphinx."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ import messages
 pytestmark = pytest.mark.whole
 DOCS = ROOT / "docs"
 SCRIPTS = sorted((DOCS / "scripts").glob("*.py"))
-# The parts of benchmarks.md are no pages, and what is generated is included.
+# Excluded are the parts of benchmarks.md, and generated files, which pages include.
 PAGES = sorted(
     path
     for path in DOCS.rglob("*.md")
     if path.parent.name != "_generated"
     if path.parent.parent.name != "benchmarks"
 )
-# What is read where the project is hosted, or in it.
+# Markdown files outside of docs/, read in the repository.
 OTHERS = sorted([*ROOT.glob("*.md"), *(ROOT / "packaging").glob("*.md")])
 BLOCK = re.compile(r"^```\{(\S+)\} ?([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 def entries(page: Path) -> list[Path]:
-    """The pages in a page's toctrees."""
+    """Return the pages in a page's toctrees."""
     found = []
     for kind, _, body in BLOCK.findall(page.read_text()):
         if kind == "toctree":
@@ -46,21 +46,21 @@ def entries(page: Path) -> list[Path]:
 
 
 def test_every_page_is_in_one_toctree() -> None:
-    """From the index on, each once; and every entry is a page."""
+    """Every page except the index is in exactly one toctree, and every entry is a page."""
     listed = [path for page in PAGES for path in entries(page)]
     assert sorted([DOCS / "index.md", *listed]) == PAGES
 
 
-def test_code_is_that_of_files_that_run() -> None:
-    """What is included exists, from a line to a later one; Python is not copied into pages."""
+def test_code_on_pages_is_included_from_tested_files() -> None:
+    """Included files and their first and last lines exist; pages contain no copied Python."""
     for page in PAGES:
         check_code(page)
 
 
 def check_code(page: Path) -> None:
-    """The test above, of a page."""
+    """Assert that the code on a page is included from a tested file."""
     text = page.read_text()
-    # Pieces for a reader who knows the rest; all of it is tested by the files that it names.
+    # Only finite.md has short excerpts, tested by the files that it names.
     assert page.stem == "finite" or "```python" not in text, page
     for kind, target, body in BLOCK.findall(text):
         if kind != "literalinclude":
@@ -78,7 +78,7 @@ def check_code(page: Path) -> None:
 
 
 def anchors(page: Path) -> set[str]:
-    """Those of a page's headings and of what it includes, as GitHub and MyST make them."""
+    """Return the anchors of headings, of included files too, as GitHub and MyST generate them."""
     text = page.read_text()
     for kind, target, _ in BLOCK.findall(text):
         if kind == "include" and "_generated" not in target:
@@ -89,15 +89,15 @@ def anchors(page: Path) -> set[str]:
 
 
 def links(page: Path) -> list[str]:
-    """Where a page leads to, pictures among it."""
+    """Return the targets of a page's links and pictures."""
     return re.findall(r"\]\(([^)\s]+)\)", page.read_text())
 
 
-def test_links_lead_somewhere() -> None:
-    """To files and headings that are there, wherever the page is read: as a page, or in its file.
+def test_link_targets_exist() -> None:
+    """Links lead to existing files and headings, on the page and in its source file.
 
-    Addresses elsewhere are asked by ``sphinx -b linkcheck``, those of pages: so others have none
-    that no page has.
+    External addresses are checked by ``sphinx -b linkcheck`` on pages only, so that other files
+    must not have addresses that are on no page.
     """
     asked = {link for page in PAGES for link in links(page)}
     dead = []
@@ -113,10 +113,10 @@ def test_links_lead_somewhere() -> None:
     assert dead == []
 
 
-def test_files_that_are_named_exist() -> None:
-    """What stands in backticks or a command and begins with a folder of the project."""
+def test_named_files_exist() -> None:
+    """Paths in backticks or commands that begin with a folder of the project exist."""
     folders = "benchmarks|demos|docker|docs|examples|packaging|scenes|tests|verification"
-    # The changelog tells of files that were there.
+    # The changelog also names files that were removed.
     pages = [page for page in [*OTHERS, *PAGES] if page.stem != "CHANGELOG"]
     named = [
         (page.name, file)
@@ -126,8 +126,8 @@ def test_files_that_are_named_exist() -> None:
     assert [(page, file) for page, file in named if not (ROOT / file).exists()] == []
 
 
-def test_tests_that_are_named_exist() -> None:
-    """What pages say that a test holds: the file is there, and in it the test, where named."""
+def test_named_tests_exist() -> None:
+    """Test files and test functions that pages name exist."""
     missing = []
     text = "".join(page.read_text() for page in PAGES)
     for file, name in re.findall(r"`(?:tests/)?(test_\w+\.py)(?:::(\w+))?`", text):
@@ -137,8 +137,8 @@ def test_tests_that_are_named_exist() -> None:
     assert missing == []
 
 
-def test_every_picture_has_its_command() -> None:
-    """It is on a page, which names a script: that it draws the picture nobody can see here."""
+def test_every_picture_names_its_script() -> None:
+    """Every picture is on a page that names a script; whether that draws it is not tested."""
     pages = [page.read_text() for page in [*PAGES, ROOT / "README.md"]]
     for picture in DOCS.glob("*.png"):
         shown = [text for text in pages if picture.name in text]
@@ -150,13 +150,13 @@ def test_every_picture_has_its_command() -> None:
 
 
 def documented() -> list[str]:
-    """Names in the reference, with dots."""
+    """Return the qualified names in the reference."""
     text = "".join(page.read_text() for page in PAGES if page.parent.name == "reference")
     return re.findall(r"^\.\. autoapi\w+:: (\S+)$", text, flags=re.MULTILINE)
 
 
 def test_every_public_name_is_in_the_reference() -> None:
-    """Those of the package, and of its public modules all that they have in ``__all__``."""
+    """Public names of the package, and ``__all__`` of its public modules, are in the reference."""
     wanted = []
     for public in set(fenics_contact.__all__) - {"__version__"}:
         value = getattr(fenics_contact, public)
@@ -172,7 +172,7 @@ def test_every_public_name_is_in_the_reference() -> None:
 
 
 def raised() -> dict[tuple[str, int], str]:
-    """Every ``raise`` that makes an error from arguments: module and line, and what it is."""
+    """Return every ``raise`` of an error with arguments, by module and line."""
     found = {}
     for path in messages.PACKAGE.rglob("*.py"):
         module = ".".join(path.relative_to(messages.PACKAGE).with_suffix("").parts)
@@ -182,8 +182,8 @@ def raised() -> dict[tuple[str, int], str]:
     return found
 
 
-def test_every_error_is_told() -> None:
-    """Each ``raise`` with a text is among the messages; others pass on what is said elsewhere."""
+def test_every_error_is_listed() -> None:
+    """Every ``raise`` with its own text is listed; the others pass on a text from elsewhere."""
     told = {(m.module, m.line) for m in messages.read() if m.kind not in ("warning", "log")}
     missing = [text for place, text in raised().items() if place not in told]
     assert sorted(missing) == [
@@ -196,8 +196,8 @@ def test_every_error_is_told() -> None:
     assert len(told) > 200
 
 
-def test_every_condition_is_told() -> None:
-    """Every module with conditions has verdict texts, and the known ones are among them."""
+def test_every_condition_is_listed() -> None:
+    """Every module with conditions has verdict texts, the known ones included."""
     verdicts = [m for m in messages.read() if m.kind == "verdict"]
     told, texts = {m.module for m in verdicts}, [m.text for m in verdicts]
     for path in (messages.PACKAGE / "checks").glob("*.py"):
@@ -209,8 +209,8 @@ def test_every_condition_is_told() -> None:
         assert any(words in text for text in texts), words
 
 
-def test_every_warning_is_told() -> None:
-    """By name of the call, as it stands in the sources."""
+def test_every_warning_is_listed() -> None:
+    """Every module lists at least as many warnings as its source has calls that warn."""
     told = Counter(m.module for m in messages.read() if m.kind == "warning")
     for path in messages.PACKAGE.rglob("*.py"):
         module = ".".join(path.relative_to(messages.PACKAGE).with_suffix("").parts)
@@ -220,8 +220,8 @@ def test_every_warning_is_told() -> None:
         assert told[module] >= len(calls) - passed_on, module
 
 
-def test_texts_are_found_wherever_they_stand(tmp_path: Path) -> None:
-    """Holes, pieces, alternatives, constants of another module, and formats of the log."""
+def test_texts_are_assembled_from_the_source(tmp_path: Path) -> None:
+    """Placeholders, pieces, alternatives, imported constants and log formats are resolved."""
     package = tmp_path / "package"
     package.mkdir()
     (package / "words.py").write_text('REMEDY = "remove it"\n')
@@ -243,8 +243,8 @@ def test_texts_are_found_wherever_they_stand(tmp_path: Path) -> None:
     ]
 
 
-def test_the_tables_have_every_text(tmp_path: Path) -> None:
-    """As rows of Markdown, in files that the page includes."""
+def test_tables_contain_every_text(tmp_path: Path) -> None:
+    """Every message is a row of a Markdown table in a file that the page includes."""
     messages.write(tmp_path)
     page = (DOCS / "messages.md").read_text()
     made = {file.name: file.read_text() for file in tmp_path.iterdir()}
@@ -258,8 +258,8 @@ def test_the_tables_have_every_text(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own")
-def test_the_line_that_ends_all_ranks(tmp_path: Path) -> None:
-    """With it a rank that raises is not waited for: all end, and its error is shown."""
+def test_documented_line_ends_all_ranks(tmp_path: Path) -> None:
+    """With this line all ranks end if one raises, and its error is shown."""
     (line,) = re.findall(r"```text\n(.*?)```", (DOCS / "learn" / "parallel.md").read_text(), re.S)
     script = tmp_path / "script.py"
     script.write_text(
@@ -276,7 +276,7 @@ def test_the_line_that_ends_all_ranks(tmp_path: Path) -> None:
 
 
 def _quoted(script: Path) -> list[str]:
-    """Lines of output that the page of a script shows."""
+    """Return the lines of output on the page of a script."""
     name = f"In full: `docs/scripts/{script.name}`"
     pages = [page.read_text() for page in PAGES if name in page.read_text()]
     blocks = [block for page in pages for block in re.findall(r"```text\n(.*?)```", page, re.S)]
@@ -284,7 +284,7 @@ def _quoted(script: Path) -> list[str]:
 
 
 def _words(line: str) -> str:
-    """How a line of output begins, without its numbers, which are other ones elsewhere."""
+    """Return the beginning of a line of output, with its numbers replaced by #."""
     return re.sub(r"\d[\d.]*(e[-+]\d+)?", "#", re.split(r"[;(]", line)[0]).strip()
 
 
@@ -292,8 +292,8 @@ def _words(line: str) -> str:
 @pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts processes of its own")
 @pytest.mark.parametrize("path", SCRIPTS, ids=[path.stem for path in SCRIPTS])
 def test_scripts_run(path: Path, tmp_path: Path) -> None:
-    """They end with 0, having asserted a number or written what the page says."""
-    for _ in range(2 if path.stem in ("log", "results") else 1):  # what is there is not in the way
+    """Scripts exit with 0, print the lines of their page, and assert a number or write files."""
+    for _ in range(2 if path.stem in ("log", "results") else 1):  # again, with existing files
         done = subprocess.run(
             [sys.executable, str(path)],
             cwd=tmp_path,
@@ -317,7 +317,7 @@ def test_scripts_run(path: Path, tmp_path: Path) -> None:
 
 
 def test_every_method_is_described() -> None:
-    """In the choices and the summary, and where the argument is described."""
+    """Every method is in choose.md, glance.md and the docstring of `ContactProblem`."""
     from fenics_contact.methods.solver import METHODS
 
     pages = [ROOT / "docs" / name for name in ("choose.md", "reference/glance.md")]

@@ -1,4 +1,4 @@
-"""Elastic bodies of every kind, in contact, against states of uniform stress and Lamé's ring."""
+"""Elastic bodies of every kind in contact, against uniform stress and Lamé's ring."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.two_ranks, pytest.mark.hexahedra]
 
 
 def ends(mesh, axis: int, high: float, low: float = 0.0):
-    """Tags BOTTOM and TOP where the coordinate is lowest and highest. Collective."""
+    """Return tags BOTTOM and TOP at the coordinates ``low`` and ``high``. Collective."""
     fdim = mesh.topology.dim - 1
     found = [
         dolfinx.mesh.locate_entities_boundary(mesh, fdim, lambda x, at=at: np.isclose(x[axis], at))
@@ -34,9 +34,9 @@ def ends(mesh, axis: int, high: float, low: float = 0.0):
 
 
 def column(kind: str, degree: int = 2, **options):
-    """A column 2 x 3 (x 2) on a frictionless rigid plane, pressed on its top.
+    """Solve a column of height 3 and sides 2 on a frictionless rigid plane, pressed on its top.
 
-    Held along x (and y) at x = 0: the axis, if it is axisymmetric.
+    Normal displacements are zero at x = 0 (and y = 0), the axis if it is axisymmetric.
     """
     d = 3 if kind == "3D" else 2
     size = [2.0, 3.0] if d == 2 else [2.0, 2.0, 3.0]
@@ -70,13 +70,13 @@ def column(kind: str, degree: int = 2, **options):
 
 
 def deviation(u: fem.Function, exact) -> float:
-    """Largest difference from a displacement given by a function of x. Collective."""
+    """Return the largest difference from a displacement given as function of x. Collective."""
     other = fem.Function(u.function_space)
     other.interpolate(exact)
     return global_max(u.function_space.mesh.comm, np.abs(u.x.array - other.x.array))
 
 
-# Kind, options, base area in contact (2 wide, thickness or 2πr or 2 deep), strain along and across.
+# Kind, options, contact area (2 by thickness, 2πr or 2), axial and transverse strain per pressure.
 UNIFORM = [
     ("plane strain", {}, 2.0, (1 - NU**2) / E, NU * (1 + NU) / E),
     ("plane strain", {"thickness": 5.0}, 10.0, (1 - NU**2) / E, NU * (1 + NU) / E),
@@ -89,10 +89,10 @@ UNIFORM = [
 @pytest.mark.each
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize(("kind", "options", "area", "along", "across"), UNIFORM)
-def test_column(kind, options, area, along, across, degree) -> None:
-    """Uniform stress: force p·area, sunk by p/k_n, shortened by Hooke's law; to 1e-8.
+def test_column_under_uniform_pressure(kind, options, area, along, across, degree) -> None:
+    """Force p·area, penetration p/k_n and strain by Hooke's law agree to 1e-8, pressure to 1e-7.
 
-    The solution is linear, so that both degrees have it; the solver stops at 1e-9 of the forces.
+    Both degrees represent the linear solution; the solver stops at 1e-9 of the forces.
     """
     body, contact = column(kind, degree, **options)
     d = len(body.u)
@@ -109,8 +109,8 @@ def test_column(kind, options, area, along, across, degree) -> None:
 
 
 @pytest.mark.parametrize(("kind", "third"), [("plane strain", -NU * PRESSURE), ("plane stress", 0)])
-def test_stress_out_of_the_plane(kind: str, third: float) -> None:
-    """σ_zz = -νp where the strain is zero, 0 where the stress is; to the solver's 1e-8."""
+def test_out_of_plane_stress(kind: str, third: float) -> None:
+    """σ_zz is -νp in plane strain and 0 in plane stress, to 1e-7 of the pressure."""
     body, _ = column(kind)
     mesh = body.u.function_space.mesh
     wrong = ufl.sqrt((body.stress[2, 2] - third) ** 2 + (body.stress[1, 1] + PRESSURE) ** 2)
@@ -119,9 +119,9 @@ def test_stress_out_of_the_plane(kind: str, third: float) -> None:
 
 
 def test_axisymmetric_ring_on_a_mandrel() -> None:
-    """A ring 10/20, free along z, on a rigid mandrel 0.01 too thick: Lamé's pressure to 1e-4.
+    """A ring of radii 10/20, free along z, on a rigid mandrel with 0.01 interference: Lamé, 1e-4.
 
-    p/k_n enlarges the compliance of the bore and is part of the reference; quadratic cells of 0.25.
+    The reference includes the compliance 1/k_n. Displacements are quadratic, cells 0.25 wide.
     """
     mesh = dolfinx.mesh.create_rectangle(
         MPI.COMM_WORLD, [(10.0, 0.0), (20.0, 2.0)], (40, 4), CellType.quadrilateral
@@ -152,11 +152,11 @@ def test_axisymmetric_ring_on_a_mandrel() -> None:
 
 
 @pytest.mark.parametrize("inner", [0.0, 1.0])
-def test_axisymmetric_disc_bears_uniformly(inner: float) -> None:
-    """A disc, or a ring, pressed by PRESSURE with multipliers: p = PRESSURE at every point.
+def test_uniform_pressure_under_axisymmetric_disc(inner: float) -> None:
+    """A disc or ring loaded by PRESSURE has p = PRESSURE at every point with multipliers, to 1e-5.
 
-    The stress is uniaxial, which linear cells have exactly; the area at a vertex is not the share
-    of it in a uniform pressure, and none on the axis. Tolerance 1e-5: that of the multipliers.
+    Linear cells represent the uniaxial stress exactly; 1e-5 is the tolerance of the augmentation.
+    Vertex quadrature is refused for the disc, since the weight vanishes on the axis.
     """
     corners = [(inner, 0.0), (inner + 2.0, 1.0)]
     mesh = dolfinx.mesh.create_rectangle(MPI.COMM_WORLD, corners, (4, 3))
@@ -189,7 +189,7 @@ def test_axisymmetric_disc_bears_uniformly(inner: float) -> None:
 
 
 def test_moduli_as_functions() -> None:
-    """Two layers in a row shorten by the sum of their compliances; scaled stiffness finds E/h."""
+    """Compliances of two layers in series add up to 1e-7, and relative stiffness uses E/h."""
     mesh = dolfinx.mesh.create_rectangle(MPI.COMM_WORLD, [(0.0, 0.0), (1.0, 2.0)], (2, 4))
     V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
     u, v = fem.Function(V), ufl.TestFunction(V)
@@ -216,8 +216,8 @@ def test_moduli_as_functions() -> None:
     assert -global_max(mesh.comm, -u.x.array) == pytest.approx(lowest, rel=1e-7)
 
 
-def test_what_has_no_sense_is_refused() -> None:
-    """Wrong kinds, dimensions and numbers: each is named."""
+def test_invalid_arguments_are_named() -> None:
+    """Errors name invalid kinds, dimensions and numbers."""
     mesh = dolfinx.mesh.create_unit_square(MPI.COMM_WORLD, 2, 2)
     u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (2,))))
     with pytest.raises(ValueError, match="kind is 'plane'"):
@@ -232,24 +232,24 @@ def test_what_has_no_sense_is_refused() -> None:
         LinearElastic(u, -1.0, NU, "plane strain")
     with pytest.raises(ValueError, match="thickness is 0"):
         LinearElastic(u, E, NU, "plane stress", thickness=0)
-    LinearElastic(u, E, 0.5, "plane stress")  # incompressible sheets are ordinary
+    LinearElastic(u, E, 0.5, "plane stress")  # incompressible sheets are valid
 
 
 @pytest.mark.each
 @pytest.mark.parametrize("isochoric", [False, True])
 @pytest.mark.parametrize("kind", ["plane strain", "axisymmetric", "3D"])
 def test_neo_hookean_column_at_large_strain(kind, isochoric):
-    """Pressed to two thirds of its height between smooth planes: uniform stretches.
+    """A column compressed to two thirds of its height without friction has uniform stretches.
 
-    Reference: the stretch across is where the stress across vanishes, by bisection in plain Python
-    with derivatives of W by hand; the force is the nominal stress along. The floor gives way by
-    p/k_n. 1e-6.
+    Reference: bisection for the transverse stretch at zero transverse stress, with derivatives of W
+    by hand. The force is the axial nominal stress times the area, to 1e-6; stretch and Cauchy
+    stress to 1e-5. The penetration p/k_n is included.
     """
     shear, lame = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
     bulk, k_n = lame + 2 * shear / 3, 1e6
 
     def stresses(across, along):
-        """Nominal stress across and along at stretches; out of the plane kind's plane it is 1."""
+        """Return transverse and axial nominal stress; plane strain has out-of-plane stretch 1."""
         stretch = np.array([across, 1.0 if kind == "plane strain" else across, along])
         volume, square = stretch.prod(), stretch @ stretch
         if isochoric:
@@ -260,7 +260,7 @@ def test_neo_hookean_column_at_large_strain(kind, isochoric):
         return part[0], part[2]
 
     nominal = 0.0
-    for _ in range(20):  # until the floor is as deep as it is pressed
+    for _ in range(20):  # fixed-point iteration for the penetration
         along = (2.0 - nominal / k_n) / 3.0
         low, high = 1.0, 1.5
         for _ in range(60):

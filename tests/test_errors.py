@@ -1,4 +1,4 @@
-"""The error budget: every part against an error that is known, from a formula or a better run."""
+"""The error budget: every part against a known error, from a formula or a better solution."""
 
 import basix.ufl
 import numpy as np
@@ -16,7 +16,7 @@ from scenes.histories import Press
 from scenes.rubbing import Aslant, cushion
 
 COMM = MPI.COMM_WORLD
-# Effectivity that is asked of an estimate: estimated over true error.
+# Accepted effectivity of an estimate: estimated over true error.
 USEFUL = (0.3, 3.0)
 
 
@@ -32,9 +32,9 @@ def press(*, n=8, k=1e4, friction=0.3, **options) -> Aslant:
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize(("cell", "degree"), GRID)
 def test_enforcement_of_uniform_pressure(cell, degree, method):
-    """A block on a plane sinks in by p/k_n, which is the whole error and its estimate (1e-8).
+    """A block on a plane penetrates by p/k_n, which is the whole error and its estimate (1e-8).
 
-    Pressure and force are given: there is no error in them. Nor is there one of discretisation.
+    Pressure and force are prescribed and have no error. There is no discretisation error either.
     """
     p, k = 3.0, 2e3
     scene = block(cell, degree, n=2, up=-p)
@@ -52,7 +52,7 @@ def test_enforcement_of_uniform_pressure(cell, degree, method):
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 def test_enforcement(friction):
-    """Against the same mesh with 300 times the stiffness, whose own error is 300 times less."""
+    """The reference has the same mesh, 300 times the stiffness and a 300th of the error."""
     soft, stiff = (press(friction=friction, k=k, n=16) for k in (1e4, 3e6))
     soft.run(steps=2)
     stiff.run(steps=2)
@@ -64,7 +64,7 @@ def test_enforcement(friction):
 
 @pytest.mark.parametrize(("cell", "degree", "n"), [("quadrilateral", 1, 12), ("triangle", 1, 8)])
 def test_discretisation(cell, degree, n):
-    """Against a mesh of four times the cells each way: force of a prescribed displacement."""
+    """The reference is the force of a prescribed displacement on a mesh four times as fine."""
     coarse, fine = (press(cell=cell, degree=degree, n=i, friction=0.0) for i in (n, 4 * n))
     coarse.run()
     fine.run()
@@ -75,10 +75,10 @@ def test_discretisation(cell, degree, n):
 
 
 def test_discretisation_of_sliding():
-    """Where all that is closed slips, friction's error is μ times that of the normal force."""
+    """If all closed points slip, the error of friction is μ times that of the normal force."""
     made = press(friction=0.3)
     made.push[-1].value, made.push[0].value = -0.03, 0.2
-    made.problem.small_displacement_tolerance = np.inf  # so far over the ball
+    made.problem.small_displacement_tolerance = np.inf  # it slides far over the ball
     made.problem.solve()
     assert made.contact.resultants().stick == 0
     found = budget(made.scene, made.problem).parts["discretisation"]
@@ -86,8 +86,8 @@ def test_discretisation_of_sliding():
     assert close(found["friction force"], 0.3 * found["normal force"], 1e-6)
 
 
-def test_increments():
-    """Against 32 increments: the friction under a contact that grows."""
+def test_increment_error():
+    """The reference is the friction force of 32 increments, in a growing contact."""
     ends = {}
     for steps in (1, 2, 4, 32):
         made = press(n=16)
@@ -104,9 +104,9 @@ def test_increments():
 
 
 @pytest.mark.parametrize("condensation", [None, False])
-def test_solver(condensation):
-    """A residual left on purpose: what was left shows to 1 %, for a residual of 1e-3."""
-    # Newton's method would end with the exact solution all the same.
+def test_solver_error(condensation):
+    """The error due to a residual of 1e-3, left on purpose, is estimated to 1 %."""
+    # Newton's method would end with the exact solution nevertheless.
     options = {"petsc_options": {"snes_rtol": 1e-3}, "method": "lbfgs"}
     rough = press(friction=0.0, condensation=condensation, **options)
     exact = press(friction=0.0, condensation=condensation)
@@ -119,10 +119,10 @@ def test_solver(condensation):
     assert close(found.parts["solver"][name], error, 0.01)
 
 
-def test_nothing_is_changed():
-    """An estimate between two increments leaves state, history and the next increment as they are.
+def test_estimate_changes_no_state():
+    """An estimate between increments changes neither state nor history nor the next increment.
 
-    1e-9: on the way the tangent's solver is used, and the next increment starts from H₀ again.
+    Tolerance 1e-9: it uses the solver of the tangent, and the next increment starts from H₀ again.
     """
     plain, asked = press(), press()
     for made in (plain, asked):
@@ -142,8 +142,8 @@ def test_nothing_is_changed():
     assert close(nodal(asked.scene.u), nodal(plain.scene.u), 1e-9)
 
 
-def test_the_same_before_and_after_the_commit():
-    """1e-6: of the springs the same is left either way, once from the increment, once committed."""
+def test_estimate_is_the_same_before_and_after_commit():
+    """The springs of the increment and those committed give the same error, to 1e-6."""
     made = press()
     made.load(1.0)
     made.problem.solve()
@@ -155,8 +155,8 @@ def test_the_same_before_and_after_the_commit():
             assert close(after.parts[part][name], value, 1e-6, scale=abs(before.values[name]))
 
 
-def test_the_table():
-    """Five lines, one for each part, and what dominates; several contacts by name."""
+def test_table_of_the_budget():
+    """The table has five lines, one for each part, and the dominant part; contacts have names."""
     made = press(k=1e3)
     step = made.run(estimate=True)[-1]
     found = budget(made.scene, made.problem, increment_error=step.increment_error)
@@ -178,8 +178,8 @@ def test_the_table():
 
 
 @pytest.mark.parametrize(("cell", "n"), [("triangle", 3), ("triangle", 8), ("hexahedron", 2)])
-def test_few_facets_are_told(cell, n):
-    """All n, or n², facets of a block bear pressure: the table warns below five in a row."""
+def test_few_facets_in_contact_are_reported(cell, n):
+    """All n, or n², facets of a block are in contact: the table warns below five in a row."""
     scene = block(cell, 1, n=n, up=-1.0)
     problem, _ = scene.problem(fc.Frictionless(k_n=1e3), scene.rollers())
     problem.solve()
@@ -188,8 +188,8 @@ def test_few_facets_are_told(cell, n):
     assert ("unreliable with fewer" in str(found)) == (n < 5)
 
 
-def test_physical_springs_are_no_error():
-    """The stiffness of a foundation is meant: no part of the displacement is due to it."""
+def test_foundation_stiffness_is_not_an_error():
+    """The stiffness of a foundation is physical: no part of the displacement is an error of it."""
     scene = block("quadrilateral", 1, n=2, up=-1.0)
     problem, _ = scene.problem(fc.Foundation(1e3), scene.rollers())
     problem.solve()
@@ -197,7 +197,7 @@ def test_physical_springs_are_no_error():
 
 
 def test_units_do_not_matter():
-    """In metres and pascals the relative errors are the same, to 1e-8."""
+    """Relative errors in metres and pascals are those in mm and MPa, to 1e-8."""
     found = []
     for length, pressure in ((1.0, 1.0), (1e-3, 1e6)):
         scene = block("triangle", 2, n=3, size=[length] * 2, E=1e3 * pressure)
@@ -213,7 +213,7 @@ def test_units_do_not_matter():
 
 
 def test_shapes_are_checked():
-    """Stress and strain of different shapes, on all ranks."""
+    """Stress and strain of different shapes are refused, on all ranks."""
     made = press(n=2)
     made.run()
     u = made.scene.u
@@ -226,10 +226,11 @@ def test_shapes_are_checked():
 
 
 @pytest.mark.parametrize("bulk", ["linear", "nonlinear"])
-def test_a_state_that_holds_no_obstacle_is_refused_and_solved_from(bulk):
-    """MUMPS' failure of the singular matrix was kept: the next solution ended in PETSc's error 76.
+def test_estimate_with_an_unconstrained_obstacle_is_refused(bulk):
+    """A refused estimate of an unconstrained obstacle does not affect the next solution.
 
-    That one is the solution of a problem whose errors nobody asked for, to the solver's tolerance.
+    MUMPS' failure with the singular matrix once remained: the next solution ended in PETSc's error
+    76. Reference: the same problem without an estimate, to 1e-8.
     """
     asked, twin = (Press(obstacle="force", wall=True, bulk=bulk) for _ in range(2))
     raised_everywhere(
@@ -242,8 +243,11 @@ def test_a_state_that_holds_no_obstacle_is_refused_and_solved_from(bulk):
     assert budget(asked.scene, asked.problem).values["floor: normal force"] > 0
 
 
-def test_the_estimate_goes_on_from_a_checkpoint(tmp_path):
-    """Broken off and taken up: the same error at the end; not from a file without (1e-7)."""
+def test_estimate_continues_from_a_checkpoint(tmp_path):
+    """An interrupted and restarted history has the same error at its end, to 1e-7.
+
+    A restart without the estimate is refused.
+    """
     whole = press()
     end = whole.run(steps=3, estimate=True)[-1].increment_error
     path = shared_folder(tmp_path) / "state.npz"
@@ -260,8 +264,8 @@ def test_the_estimate_goes_on_from_a_checkpoint(tmp_path):
     )
 
 
-def test_multipliers_leave_no_error_of_enforcement():
-    """With multipliers within 1e-5 of the tractions at most 1e-4 is left, of some 10 %."""
+def test_multipliers_have_no_enforcement_error():
+    """With multipliers, to 1e-5 of the tractions, at most 1e-4 remains of some 10 %."""
     left = {}
     for enforcement in ("penalty", "augmented"):
         scene = block("quadrilateral", 1, n=8)
@@ -275,7 +279,7 @@ def test_multipliers_leave_no_error_of_enforcement():
 
 
 def test_multigrid_gives_the_same_budget():
-    """The tangent's solver is a V-cycle there: to 1e-6, for systems are solved to 1e-8."""
+    """Budgets by V-cycles and by factors agree to 1e-6, as systems are solved to 1e-8."""
     found = []
     for kind in ("direct", "multigrid"):
         made = press(cell="hexahedron", n=4, condensation=False, linear_solver=kind)
@@ -291,10 +295,10 @@ def test_multigrid_gives_the_same_budget():
 @pytest.mark.parametrize("kind", ["plane strain", "plane stress", "axisymmetric"])
 @pytest.mark.parametrize("bulk", ["linear", "rubber", "mixed"])
 def test_stresses_of_the_package(kind, bulk):
-    """`estimate_errors(problem, body.stress)` knows what strain a stress (3, 3) does work on.
+    """`estimate_errors(problem, body.stress)` finds the strain conjugate to a stress (3, 3).
 
-    Reference: the strain as the body has it. In plane stress that across the body does no work.
-    1e-8 of the errors: the smoothing is solved to that.
+    Reference: the strain of the body. In plane stress the out-of-plane strain does no work.
+    Tolerance 1e-8 of the errors, to which the smoothing is solved.
     """
     if bulk != "linear" and kind == "plane stress":
         pytest.skip("there is no such rubber")
@@ -334,8 +338,8 @@ def test_stresses_of_the_package(kind, bulk):
             assert close(found.parts[part][name], error, 1e-8, scale=found.values[name])
 
 
-def test_the_remedy_of_large_displacements():
-    """Finite kinematics are what leaves out nothing."""
+def test_remedy_of_the_small_displacement_error():
+    """Finite kinematics are suggested, as they have no small-displacement error."""
     values = {"normal force": 1.0}
     text = str(fc.ErrorBudget(values, {"kinematics": {"normal force": 0.1}, "solver": {}}))
     assert 'kinematics dominates: Contact(kinematics="finite")' in text

@@ -1,4 +1,4 @@
-"""The examples, run as their user runs them: each asserts a number, and is short enough to read."""
+"""The examples are run as scripts; each asserts a number, and is short."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 NAMES = [path.stem for path in EXAMPLES]
 MOST_LINES = 40
 
-# Those that take the most to compile, and those that run on two ranks by default.
+# Examples with the longest compilation, and examples that run on two ranks by default.
 LONG = ("cam", "roller")
 ON_TWO_RANKS = ("ball_on_block", "two_bodies")
-# What is printed, {} standing for the result and the reference behind it, which are compared here
-# again; and the relative error that the example allows itself.
+# The printed text, with {} for the result and then its reference, which are compared here again,
+# and the relative tolerance of the example.
 NUMBER = r"(-?[\d.]+(?:e[-+]\d+)?)"
 PRINTED = {
     "ball_on_block": (r"largest pressure {} MPa\s+Hertz: {} MPa", 0.03),
@@ -38,7 +38,7 @@ PRINTED = {
 
 
 def run(path: Path, folder: Path, ranks: int) -> str:
-    """What the script prints; it must end with 0."""
+    """Return the output of the script, whose exit code must be 0."""
     words = command(ranks, path)
     done = subprocess.run(
         words, cwd=folder, env=environment(), capture_output=True, text=True, timeout=300
@@ -47,8 +47,8 @@ def run(path: Path, folder: Path, ranks: int) -> str:
     return done.stdout
 
 
-def test_each_is_run_and_named() -> None:
-    """Each of them is run below, and named in the page of examples."""
+def test_every_example_is_tested_and_documented() -> None:
+    """Every example is run below; examples and demos are listed in the page of examples."""
     assert sorted(PRINTED) == NAMES
     page = (ROOT / "docs" / "learn" / "examples.md").read_text()
     assert all(f"`{name}.py`" in page for name in NAMES)
@@ -56,8 +56,8 @@ def test_each_is_run_and_named() -> None:
     assert all(f"`{name}`" in page or f"demos/{name}.py" in page for name in demos)
 
 
-def test_they_are_short() -> None:
-    """At most 40 lines that are not blank, and a docstring whose first line says what is shown."""
+def test_examples_are_short_and_have_a_docstring() -> None:
+    """Examples have at most 40 nonblank lines, and a docstring with a one-line summary."""
     for path in EXAMPLES:
         text = path.read_text()
         assert sum(bool(line.strip()) for line in text.splitlines()) <= MOST_LINES, path
@@ -65,8 +65,8 @@ def test_they_are_short() -> None:
         assert docstring is not None and docstring.splitlines()[0].endswith("."), path
 
 
-def test_they_import_the_package_alone() -> None:
-    """None of its modules."""
+def test_examples_do_not_import_submodules() -> None:
+    """Examples import `fenics_contact`, and none of its submodules."""
     for path in EXAMPLES:
         tree = ast.parse(path.read_text())
         imported = [
@@ -90,8 +90,8 @@ def test_they_import_the_package_alone() -> None:
         )
     ],
 )
-def test_number(path: Path, ranks: tuple[int, ...], tmp_path: Path) -> None:
-    """The asserted number, on one rank and on two the same; nothing is written."""
+def test_examples_print_the_references(path: Path, ranks: tuple[int, ...], tmp_path: Path) -> None:
+    """The printed result equals its reference, on two ranks to 1e-5; no files are written."""
     pattern, tolerance = PRINTED[path.stem]
     found = []
     for number in ranks:

@@ -1,4 +1,4 @@
-"""How far contact, stick and slip reach, against closed forms and the points themselves."""
+"""Extents of contact, stick and slip, compared with closed forms and with the points."""
 
 import numpy as np
 import pytest
@@ -16,15 +16,15 @@ CELLS_IN_A = 20
 
 
 def half_widths(extent):
-    """By its measure, and by its coordinates along the line of contact."""
+    """Return the half-width by area, and by the coordinates along the line of contact."""
     return extent.area / 2, extent.size[0] / 2
 
 
-def test_hertz_and_cattaneo_mindlin():
+def test_extents_of_hertz_and_cattaneo_mindlin():
     """Pressed: a of Hertz. Sheared: c of Cattaneo and Mindlin, and slip from c to a on both sides.
 
     Within one facet, a/20: the extents are those of points, and the state may end anywhere between
-    two of them; half-discs of a/R = 0.085 for half-planes cost a fifth of that.
+    two of them; half-discs of a/R = 0.085 instead of half-planes cause a fifth of that.
     """
     scene = cylinders.press(CELLS_IN_A, 2, 10.0)
     a, c, facet = cylinders.A, cylinders.C, cylinders.A / CELLS_IN_A
@@ -45,10 +45,10 @@ def test_hertz_and_cattaneo_mindlin():
 
 
 @pytest.mark.parametrize("cell", CELLS)
-def test_they_are_those_of_the_points(cell):
-    """In the plane and in space, all states, and none: what `gather` has, to the last digits.
+def test_extents_agree_with_the_points(cell):
+    """In the plane and in space, for all states, also without points: those of `gather`, to 1e-12.
 
-    And on any number of ranks, some of them without points of a state.
+    The extents do not depend on the number of ranks, some of which may have no points of a state.
     """
     made, d = Rub(cell=cell), dimension(cell)
     made.problem.small_displacement_tolerance = np.inf
@@ -76,8 +76,8 @@ def test_they_are_those_of_the_points(cell):
     assert "contact" in seen
 
 
-def test_the_moment_is_that_about_the_origin():
-    """Of a step, as `Contact.moment` has it, on any number of ranks."""
+def test_moment_of_a_step_is_about_the_origin():
+    """The moment of a step is that of `Contact.moment` about the origin, on any number of ranks."""
     made = Rub()
     made.problem.small_displacement_tolerance = np.inf
     *_, step = fc.increments(made.problem, made.load, 0, 1.5, steps=3)

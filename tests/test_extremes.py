@@ -1,4 +1,4 @@
-"""Extreme parameters, a selection: solutions are right, and refusals state a reason.
+"""A selection of extreme parameters: solutions agree with references, refusals state a reason.
 
 References and tolerances are those of ``verification/extremes.py``.
 """
@@ -140,8 +140,8 @@ MORE = [
 @pytest.mark.skipif(COMM.size > 1, reason="scenes of other tests run in parallel")
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("trial", FAST + MORE, ids=lambda t: f"{t.group} {t.case}")
-def test_extreme(trial, method):
-    """Verified within the tolerance of the reference, or refused in words."""
+def test_extreme_parameters(trial, method):
+    """The solution is within the tolerance of the reference, or the error states a reason."""
     (row,) = dataclasses.replace(trial, methods=(method,)).run()
     assert not row.has_failed, row
     refused = trial.case in REFUSED
@@ -150,15 +150,15 @@ def test_extreme(trial, method):
 
 @pytest.mark.skipif(COMM.size > 1, reason="scenes of other tests run in parallel")
 @pytest.mark.parametrize("trial", LARGE, ids=lambda t: f"{t.group} {t.case} {t.methods[0]}")
-def test_extreme_of_finite_kinematics(trial):
-    """Verified within the tolerance of the reference."""
+def test_extreme_parameters_with_finite_kinematics(trial):
+    """The solution is verified and within the tolerance of the reference."""
     (row,) = trial.run()
     assert not row.has_failed, row
     assert row.outcome == "verified" and row.reference, row
 
 
 def test_selected_trials_exist():
-    """Every name above is the name of a trial."""
+    """Every selected name is the name of a trial."""
     assert len(FAST) == sum(len(cases) for cases in CHOSEN.values())
     wanted = [cases for chosen in (FINITE, BODIES) for cases in chosen.values()]
     assert len({(t.group, t.case) for t in LARGE}) == sum(map(len, wanted))
@@ -176,8 +176,8 @@ def test_contact_on_one_rank_only(kind, method):
     assert close(rows, spread, 1e-8, scale=np.abs(rows[:, 2:]).max())
 
 
-def test_page_follows_from_stored_rows():
-    """The page is that of the stored rows, which are those of all trials."""
+def test_page_agrees_with_stored_rows():
+    """The page agrees with the stored rows, which contain all trials."""
     rows = known(PAGE.with_suffix(".csv"))
     assert list(rows) == [(t.group, t.case, method) for t in trials() for method in t.methods]
     assert page(list(rows.values())) == PAGE.read_text(encoding="utf-8")

@@ -1,8 +1,8 @@
-"""Faults put in on purpose: all ranks end with the error, and nothing is lost or half done.
+"""Injected faults: all ranks raise the error, and no state or file is lost or half written.
 
-After every fault the state is that of the last commit, to the bit; and the same problem then makes
-the increment with the result of one that never failed (1e-8: two solutions within the solver's
-tolerance of 1e-9).
+After every fault the state is exactly that of the last commit, and the same problem then solves the
+increment with the result of one without a fault (1e-8: two solutions within the solver's tolerance
+of 1e-9).
 """
 
 import json
@@ -33,16 +33,16 @@ COMM = MPI.COMM_WORLD
 LAST = COMM.size - 1
 METHODS = ("lbfgs", "newton", "continuation", "alternating")[: 4 if COMM.size == 1 else 2]
 
-# Long enough for a loaded machine; what hangs is ended.
+# The timeout is long enough for a loaded machine; a deadlock is ended.
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
 class Fault(Exception):
-    """What nothing in the package raises."""
+    """An error that nothing in the package raises."""
 
 
 def failing(function, after, error=Fault, *, rank=None):
-    """The function, that raises at a call later than ``after``, on all ranks or on one."""
+    """Return the function such that it raises after ``after`` calls, on all ranks or on one."""
     calls = [0]
 
     def call(*args, **kwargs):
@@ -55,7 +55,7 @@ def failing(function, after, error=Fault, *, rank=None):
 
 
 def survives(made, call, kind, *words):
-    """The call raises on all ranks, leaves no trace, and what comes after is as without it."""
+    """Check that the call raises on all ranks and leaves the state of the problem unchanged."""
     before, increment = snapshot(made), made.problem.increment
     raised_everywhere(call, kind, *words)
     assert identical(snapshot(made), before)
@@ -64,19 +64,19 @@ def survives(made, call, kind, *words):
 
 
 def told(error):
-    """What comes of an error on the first rank alone."""
+    """Return the types that this rank may raise for an error on the first rank only."""
     return error if COMM.rank == 0 else (error, RuntimeError)
 
 
 def goes_on(made, twin):
-    """The increment is made after all."""
+    """Solve the increment, and compare u with that of the problem without faults, to 1e-8."""
     for m in (made, twin):
         walk(m, path=PATH[2:3])
     assert close(nodal(made.scene.u), nodal(twin.scene.u), 1e-8)
 
 
 def pair(method="lbfgs", **kwargs):
-    """Two that have made two increments and are loaded for the third."""
+    """Return two problems after two increments, with the load of the third."""
     both = [Rub(method=method, **kwargs) for _ in range(2)]
     for made in both:
         walk(made, path=PATH[:2])
@@ -90,8 +90,8 @@ def pair(method="lbfgs", **kwargs):
 @pytest.mark.each
 @pytest.mark.parametrize("condensation", [None, False])
 @pytest.mark.parametrize("method", METHODS)
-def test_an_exception_in_a_callback(method, condensation, monkeypatch):
-    """It comes out as it is, from the residual, and from the matrix where SNES asks for one."""
+def test_exception_in_a_callback_is_raised_unchanged(method, condensation, monkeypatch):
+    """An exception in the residual or, if SNES evaluates it, the tangent is raised unchanged."""
     made, twin = pair(method, condensation=condensation)
     equations = made.problem.solver.equations
     names = {"newton": "assemble_tangent", "continuation": "assemble_tangent"}
@@ -104,11 +104,8 @@ def test_an_exception_in_a_callback(method, condensation, monkeypatch):
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
-def test_one_rank_raises(method, monkeypatch):
-    """In the assembly on its own cells or facets, as if its memory were at an end.
-
-    The other ranks get the text.
-    """
+def test_exception_on_one_rank_is_raised_on_all(method, monkeypatch):
+    """A MemoryError in the assembly on one rank is raised there; the other ranks get its text."""
     made, twin = pair(method)
     for after in (0, 4):
         with monkeypatch.context() as patch:
@@ -119,8 +116,8 @@ def test_one_rank_raises(method, monkeypatch):
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
-def test_snes_is_stopped(method, monkeypatch):
-    """By a limit that somebody set, in whichever iteration; and by an interrupt from outside."""
+def test_stopped_snes_restores_the_last_commit(method, monkeypatch):
+    """SNES is stopped by an iteration limit of 0 or 1, and by KeyboardInterrupt in its test."""
     made, twin = pair(method)
     limit = made.problem.solver.main.max_it
     for allowed in (0, 1):
@@ -149,10 +146,10 @@ def test_snes_is_stopped(method, monkeypatch):
         (dense.UpdatedLU, "_solve"),
     ],
 )
-def test_an_exception_in_a_dense_solve(kind, name, method, error, monkeypatch):
-    """It comes out as it is from the matrix and the solver that PETSc calls, at whichever call.
+def test_exception_in_a_dense_solve_is_raised_unchanged(kind, name, method, error, monkeypatch):
+    """An exception in any call of the dense factorisation or solve by PETSc is raised unchanged.
 
-    The dense matrix is on the first rank; the others get the text.
+    The dense matrix is on the first rank; the other ranks get the text of the error.
     """
     made, twin = pair(method)
     for after in (0, 1, 2, 5):
@@ -171,7 +168,7 @@ def test_an_exception_in_a_dense_solve(kind, name, method, error, monkeypatch):
 
 @contextmanager
 def interrupted_at(event: int):
-    """Ctrl-C at a call or return of any function, Python's or C's, counted; it yields the count."""
+    """Send Ctrl-C at the given call or return of a Python or C function; yield their count."""
     events = [0]
 
     def count(*_):
@@ -188,7 +185,7 @@ def interrupted_at(event: int):
 
 @pytest.fixture
 def python_is_interrupted():
-    """By Ctrl-C, as at its start: gmsh has the process ended instead, from its first use on."""
+    """Restore Python's handler of Ctrl-C: gmsh replaces it by one that ends the process."""
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, handler)
@@ -202,9 +199,9 @@ def python_is_interrupted():
 @pytest.mark.parametrize("condensation", [True, False])
 @pytest.mark.parametrize("method", METHODS)
 def test_an_interrupt_at_any_time(method, condensation):
-    """Ctrl-C while PETSc runs or calls back: KeyboardInterrupt and no trace of the increment.
+    """Ctrl-C in PETSc or its callbacks raises KeyboardInterrupt and restores the last commit.
 
-    By the count of calls, not by the clock: a solution may be over within a tick of a timer.
+    Interrupts are sent by the count of calls: a solve may take less than the tick of a timer.
     """
     made, twin = pair(method, condensation=condensation)
     made.problem.solve()  # compiles
@@ -217,7 +214,7 @@ def test_an_interrupt_at_any_time(method, condensation):
     for share in np.linspace(0.01, 0.99, 50):
         with pytest.raises(KeyboardInterrupt), interrupted_at(int(share * events[0])):
             made.problem.solve()
-        if close(snapshot(made)[0], solved, 1e-8):  # all was done
+        if close(snapshot(made)[0], solved, 1e-8):  # the solve was complete
             made.problem.restore()
         assert identical(snapshot(made), before)
         assert signal.getsignal(signal.SIGINT) is handler
@@ -225,8 +222,8 @@ def test_an_interrupt_at_any_time(method, condensation):
 
 
 @pytest.mark.parametrize("name", ["product", "_solve"])
-def test_an_exception_in_a_linearised_solve(name, monkeypatch):
-    """In the products and solutions of the error estimate: it comes out, and none comes after."""
+def test_exception_in_a_linearised_solve_is_raised_unchanged(name, monkeypatch):
+    """An exception in a product or solve of the error estimate is raised; later solves succeed."""
     made, twin = pair("newton")
     made.problem.solve()
     kind = dense.SumOperator if name == "product" else dense.UpdatedLU
@@ -246,8 +243,8 @@ def test_an_exception_in_a_linearised_solve(name, monkeypatch):
         ("lbfgs", True, "contact_interior_"),
     ],
 )
-def test_memory_refused(method, condensation, prefix):
-    """MUMPS may take 1 MB, which is not enough for this mesh: MemoryError, not a wrong answer."""
+def test_mumps_out_of_memory_raises_memory_error(method, condensation, prefix):
+    """MUMPS with a limit of 1 MB, too little for this mesh, gives MemoryError, not a solution."""
     made = Rub(mesh={"n": 64}, method=method, condensation=condensation)
     made.move(*PATH[0])
     options, key = PETSc.Options(), f"{prefix}mat_mumps_icntl_23"
@@ -275,8 +272,8 @@ made.problem.solve()
 
 @pytest.mark.skipif(COMM.size > 1, reason="starts ranks of its own")
 @pytest.mark.parametrize("name", ["residual_at", "is_converged"])
-def test_one_rank_fails_alone(name):
-    """Where nothing tells the other ranks, which wait: all are ended, with the error shown."""
+def test_error_on_one_rank_without_communication_aborts_all(name):
+    """If the other ranks wait for a failed one, all are aborted, and the error is printed."""
     words = command(2, "-c", ALONE.format(name=name))
     done = subprocess.run(words, env=environment(), capture_output=True, timeout=60)
     said = done.stderr.decode(errors="replace")
@@ -284,8 +281,8 @@ def test_one_rank_fails_alone(name):
     assert "rank 1 failed while the others were waiting" in said and "ZeroDivisionError" in said
 
 
-def test_a_load_fails_on_one_rank():
-    """The user's own function raises on one rank: all end, the load is that of before."""
+def test_error_in_a_load_function_on_one_rank_is_raised_on_all():
+    """The user's load function raises on one rank: all ranks raise, and the load is restored."""
     made = Rub()
 
     def load(t):
@@ -306,8 +303,8 @@ def test_a_load_fails_on_one_rank():
 # ---- in a commit ---------------------------------------------------------------------------------
 
 
-def test_a_commit_fails():
-    """The second contact's evaluation fails: the first one's history is as before, too."""
+def test_failed_commit_restores_the_history():
+    """An error after the history was written in `commit` restores the state before the solve."""
     made, twin = pair()
     problem = made.problem
     before = snapshot(made)
@@ -331,7 +328,7 @@ def test_a_commit_fails():
 
 @contextmanager
 def full_disk(size: int):
-    """No file of this process can grow beyond so many bytes, whoever writes it."""
+    """Limit the size of every file that this process writes, in bytes."""
     old = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, old[1]))
     try:
@@ -351,8 +348,8 @@ def files(folder: Path) -> dict[str, bytes]:
 @pytest.mark.skipif(COMM.size > 1, reason="the limit would hit what MPI keeps in files, too")
 @pytest.mark.parametrize("kind", ["checkpoint", "json", "series", "picture"])
 @pytest.mark.parametrize("first", [True, False])
-def test_a_full_disk(kind, first, tmp_path):
-    """A file that could not be written is not there, or as it was; the next one is whole."""
+def test_full_disk_leaves_files_unchanged(kind, first, tmp_path):
+    """A file that could not be written is absent or unchanged; the next one is complete."""
     made = Rub()
     walk(made, path=PATH[:2])
     points = made.contact.gather()
@@ -363,7 +360,7 @@ def test_a_full_disk(kind, first, tmp_path):
         "picture": lambda: plotting.plot_tractions(tmp_path / "p.png", points),
     }[kind]
     if kind == "picture":
-        write()  # the fonts' cache is written once
+        write()  # the font cache is written once
         os.remove(tmp_path / "p.png")
     if not first:
         write()
@@ -381,8 +378,8 @@ def test_a_full_disk(kind, first, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["json", "series"])
-def test_writing_fails_on_one_rank(kind, tmp_path, monkeypatch):
-    """All ranks end, and no half of it is there."""
+def test_failed_writing_leaves_no_files(kind, tmp_path, monkeypatch):
+    """All ranks raise if a file cannot be renamed to its final name, and no part of it is left."""
     folder = shared_folder(tmp_path)
     made = Rub()
     write = {
@@ -397,8 +394,8 @@ def test_writing_fails_on_one_rank(kind, tmp_path, monkeypatch):
     assert files(folder)
 
 
-def test_errors_are_shared():
-    """The rank that raises keeps its error; the others get its text, and its type if it can be."""
+def test_collective_errors_raise_on_all_ranks():
+    """The failing rank raises its error; the others its text, and its type where possible."""
 
     def call(kind):
         with parallel.collective_errors(COMM):

@@ -1,4 +1,4 @@
-"""Finite kinematics at single states: derivatives, the boundary form, what is refused."""
+"""Finite kinematics at single states: derivatives, boundary form, invalid arguments."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ IN_SPACE = {
 
 
 def obstacles(scene, shift, angle):
-    """Shapes that cut into the top of the block, by name."""
+    """Return obstacles that penetrate the top of the block, by name."""
     d, top = scene.dim, scene.height
     turn = fc.Rotation(angle, (0.2,) * d, None if d == 2 else (1.0, 2.0, 3.0))
     move = {"displacement": shift, "rotation": turn}
@@ -50,7 +50,7 @@ def obstacles(scene, shift, angle):
 
 
 def _lens(middle, move):
-    """A smooth bump that is not round; in space on one side turned about a slanting axis."""
+    """Return a smooth bump that is not circular; in 3D a profile about an inclined axis."""
     t = np.linspace(-0.9, 0.9, 19)
     if len(middle) == 2:
         down = np.column_stack([t, 0.6 * t**2 + 0.1 * t**3 - 0.8])
@@ -62,14 +62,14 @@ def _lens(middle, move):
 
 
 def _gem(middle, move):
-    """Few large facets, with edges and corners in the middle of Γc."""
+    """Return an obstacle of few large facets, with edges and corners in the middle of Γc."""
     if len(middle) == 2:
         return fc.RigidSurface(circle(7, 0.85, middle), ring(7), **move)
     return fc.RigidSurface(*ball(1, 0.85, middle), **move)
 
 
 def _ellipsoid(x, middle):
-    """No distance, but its gradient has length 1 where it vanishes."""
+    """Return a level set that is no distance, with a gradient of length 1 where it is zero."""
     axes = [1.0, 0.8, 0.9][: len(middle)]
     level = sum((x[i] - middle[i]) ** 2 / axes[i] ** 2 for i in range(len(middle)))
     slope = 2 * ufl.sqrt(sum((x[i] - middle[i]) ** 2 / axes[i] ** 4 for i in range(len(middle))))
@@ -77,7 +77,7 @@ def _ellipsoid(x, middle):
 
 
 def derivative_error(contact, scene, seed, step=1e-6):
-    """Tangent times a direction, against central differences of the forces, relative."""
+    """Return the relative error of tangent times direction by central differences, and scale."""
     u, operator = scene.u, fc.ContactOperator(contact)
     direction = fem.Function(u.function_space)
     direction.interpolate(wave(scene.dim, seed))
@@ -98,14 +98,14 @@ def derivative_error(contact, scene, seed, step=1e-6):
 
 
 def forces(operator):
-    """Minus the forces of contact at the unknowns."""
+    """Return minus the contact forces at the dofs."""
     vector = operator.unknowns.vector()
     operator.add_force(vector)
     return vector
 
 
 def states(scene, contact, shift, angle, n=3):
-    """States of a history that moves block and tool by a third of the block."""
+    """Yield states of a history in which block and obstacle move, and commit them."""
     for seed in range(n):
         scene.u.interpolate(lambda x, seed=seed: 0.06 * wave(scene.dim, seed)(x))
         shift.value[:] = 0.05 * np.cos(seed + np.arange(scene.dim))
@@ -117,10 +117,11 @@ def states(scene, contact, shift, angle, n=3):
 @pytest.mark.each
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("cell", CELLS)
-def test_derivatives(cell, shape):
-    """Tangents against differences, over a history in which open, stick and slip all occur.
+def test_tangent_agrees_with_finite_differences(cell, shape):
+    """Tangents agree with differences over a history with open, sticking and slipping points.
 
-    1e-6 of the largest entry: differences of 1e-6 have an error of 1e-9 where no status changes.
+    Tolerance 1e-6 of the largest entry; differences with a step of 1e-6 have an error of 1e-9 if no
+    status changes.
     """
     seen = np.zeros(3)
     laws = LAWS if cell in ("triangle", "quadrilateral") else LAWS | IN_SPACE
@@ -143,11 +144,11 @@ def test_derivatives(cell, shape):
     ("shape", "enforcement"),
     [("ball", "penalty"), ("ball", "augmented"), ("profile", "penalty"), ("facets", "augmented")],
 )
-def test_the_boundary_form_is_the_same(cell, shape, enforcement):
-    """`Contact.form` and its tangent have the expressions of the obstacle, and not samples of them.
+def test_boundary_form_agrees_with_the_operator(cell, shape, enforcement):
+    """`Contact.form` and its tangent use expressions of the obstacle instead of point values.
 
-    Of an obstacle from data they have its expansion about where it was sampled last. Nodal forces
-    and products with the tangent agree to round-off, 1e-11.
+    For obstacles from data they use the expansion about the last evaluation. Nodal forces and
+    products with the tangent agree to round-off, 1e-11.
     """
     scene = rubber(cell, 1, n=(4, 2))
     v, du = (f(scene.u.function_space) for f in (ufl.TestFunction, ufl.TrialFunction))
@@ -178,8 +179,8 @@ def test_the_boundary_form_is_the_same(cell, shape, enforcement):
         assert global_max(comm, np.abs(ours.array_r - other.array_r)) < 1e-11 * size
 
 
-def test_without_friction_the_tangent_is_symmetric():
-    """The tractions are minus the gradient of the potential, ½ k ⟨-d⟩²: by differences, to 1e-6."""
+def test_frictionless_tangent_is_symmetric():
+    """Forces are derivatives of the potential ½ k ⟨-d⟩² to 1e-6, the tangent symmetric to 1e-13."""
     scene = rubber("tetrahedron", 1, n=(4, 2))
     contact = scene.contact(disc(scene, 0.8, displacement=(0, 0, -0.2)), fc.Frictionless(K))
     assert contact.effective_law.has_potential
@@ -265,6 +266,6 @@ FLOOR = fc.HalfSpace((0, 1), (0, -1))
         ),
     ],
 )
-def test_refused(make, error, text):
-    """Before any work, on all ranks, with what to give instead."""
+def test_invalid_arguments_are_refused(make, error, text):
+    """Creation of the contact raises on all ranks, and the error states a remedy."""
     raised_everywhere(make, error, text)

@@ -1,4 +1,4 @@
-"""Histories with finite kinematics: what must not change the answer, and what must."""
+"""Load histories with finite kinematics: frame invariance, work, rolling and rotation."""
 
 from __future__ import annotations
 
@@ -29,11 +29,12 @@ PATH = [(0.0, -0.06), (0.0, -0.12), (0.05, -0.15), (0.1, -0.15), (0.06, -0.14)]
     ],
 )
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_body_or_tool_dragged(cell, shape, enforcement):
-    """The block moved by -a under a disc at rest feels what it does under a disc moved by +a.
+def test_moving_the_body_or_the_tool_is_equivalent(cell, shape, enforcement):
+    """Moving the block by -a under a fixed disc is equivalent to moving the disc by a.
 
-    Tractions to 1e-9 of the largest: round-off in places, times the stiffness; with multipliers,
-    whose rounds end at 1e-9, to 1e-7. Between flat facets there is more than one answer.
+    Tractions agree to 1e-9 of the largest, due to round-off of positions times the stiffness; with
+    multipliers, whose augmentations end at 1e-9, to 1e-7. Faceted tools are excluded: their
+    solution is not unique.
     """
     options = {"contact": {"enforcement": enforcement, "tolerance": 1e-9}, "shape": shape}
     allowed = 1e-9 if enforcement == "penalty" else 1e-7
@@ -48,7 +49,7 @@ def test_body_or_tool_dragged(cell, shape, enforcement):
 
 
 def _turned(tool, matrix, side, up):
-    """Have block and disc turned about the origin, the disc displaced by (side, up) before."""
+    """Turn block and disc about the origin after displacing the disc by (side, up)."""
     centre = tool.vector(0.0, tool.scene.height + 0.8)
     tool.scene.place(lambda x: matrix @ x)
     return matrix @ (centre + tool.vector(side, up)) - centre
@@ -66,12 +67,12 @@ def _turned(tool, matrix, side, up):
         ("tetrahedron", "facets", "penalty"),
     ],
 )
-def test_turning_the_whole_scene_only_turns_the_answer(cell, shape, enforcement):
-    """Pressed and dragged, then all turned by 1.2 rad in four increments, then dragged on.
+def test_rotation_of_the_whole_scene_rotates_the_tractions(cell, shape, enforcement):
+    """The scene is pressed and dragged, turned by 1.2 rad in four increments, and dragged on.
 
-    Not on 24 segments, where a point at a corner finds either of two answers, as steps have it.
-    In space about an axis oblique to the normal. Tractions are those of the scene that was not
-    turned, turned: 1e-9 of the largest, with multipliers whose rounds end there 1e-7.
+    In 3D the axis is oblique to the normal. The tractions are those of the scene without rotation,
+    rotated, to 1e-9 of the largest, and with multipliers, whose augmentations end there, to 1e-7. A
+    disc of 24 segments is excluded in 2D: a point at a corner has two solutions.
     """
     d = 2 if cell == "triangle" else 3
     axis = np.array([0.6, 0.0, 0.8])
@@ -108,10 +109,10 @@ def test_turning_the_whole_scene_only_turns_the_answer(cell, shape, enforcement)
 
 @pytest.mark.parametrize("law", [fc.Frictionless(1e4), fc.Coulomb(0.2, 1e4, 1e4)])
 def test_small_and_finite_agree_to_first_order(law):
-    """Linear elastic block with a domed top in the cavity that it fits.
+    """A linear elastic block with a domed top is pressed into a cavity that it fits.
 
-    Tractions differ by a share that is proportional to the displacement: four times smaller, four
-    times less; 25 % for the terms of higher order.
+    The relative difference of the contact forces is proportional to the displacement: a quarter of
+    it for a quarter of the displacement, to 25 % for terms of higher order.
     """
     share = []
     for size in (4e-3, 1e-3):
@@ -136,11 +137,11 @@ def test_small_and_finite_agree_to_first_order(law):
     assert share[0] / share[1] == pytest.approx(4.0, rel=0.25)
 
 
-def test_a_loop_without_friction_gives_all_work_back():
-    """Pressed, dragged, turned and lifted on another way, back to the start.
+def test_frictionless_loop_does_no_work():
+    """The tool is pressed, dragged while it turns, and lifted along another path.
 
-    Work of the tool over the loop, by means of forces at both ends of 48 increments: 1e-3 of what
-    it takes to press. Without friction nothing remembers the way: the last force is 0.
+    Its work in 48 increments, by the mean of the forces at both ends of each, is at most 1e-3 of
+    the largest work on the path. Without friction there is no history: the last force is 0.
     """
     tool = Tool(law=fc.Frictionless(1e4), n=(8, 4))
     corners = [(0, 0, 0), (0, -0.15, 0), (0.2, -0.15, 1), (0.2, 0, 1)]
@@ -156,11 +157,11 @@ def test_a_loop_without_friction_gives_all_work_back():
     assert np.linalg.norm(tool.resultant()) < 1e-9
 
 
-def test_a_free_roller_rolls():
-    """A disc that turns as it moves, by side/R, is held by less friction than one that slides.
+def test_rolling_disc_has_less_friction_than_a_sliding_one():
+    """A disc that rolls, turning by side/R, has less than a third of the friction of sliding.
 
-    Pulled along by 0.3: sliding takes μN, rolling (and creeping) less than a third of it; one that
-    turns on the spot takes μN too.
+    After a displacement of 0.3 the friction force of sliding is μN to 10 %, and so is that of a
+    disc that turns without displacement; a rolling disc has creep.
     """
     radius, push = 0.8, -0.1
     forces = {}
@@ -181,11 +182,11 @@ def test_a_free_roller_rolls():
     assert tool.resultant()[0] == pytest.approx(0.3 * -tool.resultant()[1], rel=0.1)
 
 
-def test_a_drum_that_turns_all_the_way_round():
-    """Pressed, then turned by 360° in 12 increments: it slides, and nothing changes any more.
+def test_friction_moment_of_a_full_turn():
+    """A disc is pressed, then turned by 360° in 12 increments with all closed points slipping.
 
-    The moment about its axis is that of friction μ p at the distance R - δ, 1e-9; forces after the
-    first half turn stay, 1e-9.
+    The moment about its axis is that of friction μ p at the distance R - δ, to 1e-9. The forces
+    after half a turn and a full turn agree to 1e-9.
     """
     radius, friction = 0.8, 0.3
     tool = Tool(radius=radius, law=fc.Coulomb(friction, 1e4, 1e4))
@@ -204,10 +205,10 @@ def test_a_drum_that_turns_all_the_way_round():
     assert contact.resultants().stick == 0
 
 
-def test_no_solution_is_turned_inside_out():
-    """An increment in which Newton's method without a line search finds J < 0: refused, or right.
+def test_no_solution_has_inverted_cells():
+    """Newton's method without line search finds J < 0: the increment is refused, or has J > 0.
 
-    Verified, it was a force of 2397 where smaller increments lead to 86.8.
+    The state with J < 0 has a force of 2397; smaller increments lead to 86.8.
     """
     tool = Tool(n=(16, 8), law=fc.Coulomb(0.3))
     tool.problem, tool.contact = tool.scene.problem(
@@ -227,9 +228,10 @@ def test_no_solution_is_turned_inside_out():
 
 
 def test_newton_converges_quadratically():
-    """Where no status changes any more the residual r becomes at most of the order of r².
+    """Once the active set is fixed, each residual is of the order of the square of the last.
 
-    Of the last three above round-off each is below the square root of the last but one's share.
+    Asserted is an order of convergence above 1.7 for the last two residuals relative to the first,
+    and fewer than 8 residuals in all.
     """
     tool = Tool(law=fc.Frictionless(1e4))
     tool.problem, tool.contact = tool.scene.problem(
@@ -242,16 +244,16 @@ def test_newton_converges_quadratically():
     norms = []
     tool.problem.snes.setMonitor(lambda snes, i, norm: norms.append(norm))
     tool.go(0.0, -0.11)
-    norms = [norm for norm in norms if norm > 0]  # what is left may be round-off alone
+    norms = [norm for norm in norms if norm > 0]  # zero may be reached exactly
     shares = np.log10(np.array(norms[-3:]) / norms[0])
     assert shares[2] < 1.7 * shares[1]
     assert len(norms) < 8
 
 
-def test_area_and_moment_of_a_body_that_turns_and_grows():
-    """A block moved by x = 1.25 R X: area grows by 1.25^(d-1), moments are of present places.
+def test_area_and_moment_of_a_rotated_and_stretched_body():
+    """With x = 1.25 R X the area is 1.25^(d-1) times as large; moments use present positions.
 
-    Reference: the moment of the forces at R X, by their sum over the points in plain numpy; 1e-12.
+    Reference: sum over the points in numpy of the moments of forces at 1.25 R X, to 1e-12.
     """
     for cell in ("triangle", "tetrahedron"):
         tool = Tool(cell, n=(4, 2))
@@ -262,7 +264,7 @@ def test_area_and_moment_of_a_body_that_turns_and_grows():
         tool.scene.u.interpolate(lambda x, d=d, turn=turn: 1.25 * turn @ x[:d] - x[:d])
         contact = tool.contact
         assert close(contact.area_stretch(), np.full(len(contact.points), 1.25 ** (d - 1)), 1e-12)
-        # The tool is where the block has grown to, and cuts into it.
+        # The tool follows the stretched block and penetrates it.
         tool.shift.value[:] = 1.95 * turn @ tool.vector(0.0, 1.0) - tool.vector(0.1, 1.8)
         contact.evaluate()
         about = np.arange(1.0, d + 1)

@@ -1,4 +1,4 @@
-"""Finite kinematics against numbers of another program."""
+"""Finite kinematics compared with numbers of another program."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from verification.extreme_finite import rotated_together
 
 pytestmark = pytest.mark.two_ranks
 
-# Force on half of the disc at every 0.25 of its way: verification/getfem_disc.py, GetFEM 5.4.2.
+# Force on half of the disc at every 0.25 of its path: verification/getfem_disc.py, GetFEM 5.4.2.
 GETFEM = (
     *(59.800408, 136.348555, 223.719622, 319.588569, 422.751726, 532.564461),
     *(649.491631, 772.146797, 900.426090, 1035.217694, 1174.778480, 1320.350256),
 )
 
 # The same with friction: force on the block along x and y, and torque about the disc's centre,
-# while it is pressed (12 increments), turned (8) and dragged (8).
+# while it is pressed (12 increments), rotated (8) and dragged (8).
 GETFEM_FRICTION = (
     (0.000000, -128.252858, 0.000000),
     (0.000000, -294.985949, 0.000000),
@@ -96,10 +96,10 @@ GETFEM_TWO = {
 
 @pytest.mark.parametrize("cross_check", [False, True])
 def test_rubber_block_under_a_disc(cross_check):
-    """Half a block 5 x 10 pressed by 3 with a disc of radius 4, without friction.
+    """Half a block 5 x 10 is pressed by 3 with a disc of radius 4, without friction.
 
-    The mesh, elements and rules of the reference, which has the same penalty but no code in
-    common. 1e-7 of the force: six digits behind the point are written down.
+    Mesh, elements, quadrature and penalty are those of the reference, which shares no code. 1e-7 of
+    the force: six decimals are recorded.
     """
     mesh, tags = block_mesh("quadrilateral", n=(10, 20), size=(5.0, 10.0))
     u = fem.Function(displacement_space(mesh, 2))
@@ -124,11 +124,11 @@ def test_rubber_block_under_a_disc(cross_check):
 
 
 def test_rubber_block_pressed_turned_and_dragged():
-    """A block 16 x 10 with μ = 0.3: pressed by 3, the disc turned by 0.8, then dragged by 2.
+    """A block 16 x 10 with μ = 0.3: pressed by 3, the disc rotated by 0.8, then dragged by 2.
 
-    While it turns points stick, then slip, until all of them do; dragging adds nothing to that but
-    the way. 1e-7 of the force that presses, for the torque over the radius, too: six digits behind
-    the point are written down.
+    During the rotation points stick, then slip, until all of them slip; dragging adds only slip
+    distance. 1e-7 of the normal force, also for the torque over the radius: six decimals are
+    recorded.
     """
     mesh, tags = block_mesh("quadrilateral", n=(32, 20), size=(16.0, 10.0))
     mesh.geometry.x[:, 0] -= 8
@@ -157,18 +157,18 @@ def test_rubber_block_pressed_turned_and_dragged():
         found = np.array([x, y, contact.moment(centre)[0] / 4.0])
         wanted = np.array(expected) / (1.0, 1.0, 4.0)
         assert found == pytest.approx(wanted, abs=1e-7 * abs(expected[1]))
-    # GetFEM: 282; without the tractions of sticking points in the first guesses 170.
+    # GetFEM: 282; without the tractions of sticking points in the predictor 170.
     assert iterations <= 115
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
-def test_a_block_of_rubber_dragged_over_another(friction):
-    """The mesh, elements, points, penalty and friction of the reference, and no code in common.
+def test_rubber_block_dragged_over_another(friction):
+    """Mesh, elements, points, penalty and friction are the reference's, which shares no code.
 
-    There partners are found by GetFEM's raytracing, and derivatives are those of its language. 1e-7
-    of the largest force: six digits behind the point are written down. Its brick for large sliding,
-    with multipliers linear along the side, bears 137.7 and 40.35 at the end, 3.5 % more: nothing
-    penetrates, here by up to 4 % of the depth.
+    There opposite points are found by GetFEM's raytracing, and derivatives are those of its
+    language. 1e-7 of the largest force: six decimals are recorded. Its brick for large sliding,
+    with multipliers linear along the side, has forces of 137.7 and 40.35 at the end, 3.5 % more:
+    nothing penetrates, here by up to 4 % of the depth.
     """
     made = rubbed.Rubbed(friction)
     problem = fc.ContactProblem(
@@ -185,15 +185,15 @@ def test_a_block_of_rubber_dragged_over_another(friction):
         problem.commit()
         found = made.contact.resultants().force
         assert found == pytest.approx(np.array(expected), abs=1e-7 * size)
-    # GetFEM by full steps, to 1e-9: 200 in all with friction, 27 in five increments without it.
+    # GetFEM with full steps, to 1e-9: 200 with friction, 27 in five increments without it.
     assert iterations <= (125 if friction else 30)
 
 
-def test_a_body_led_round_with_its_tool_takes_few_steps():
-    """A full turn in 36 increments: the first tractions again, to 1e-9, what is solved to.
+def test_body_rotated_with_its_tool_takes_few_iterations():
+    """A full rotation in 36 increments restores the first tractions, to 1e-9, the tolerance.
 
-    The first guess follows body and tool, 228 steps; by the body alone, as if the tool stayed
-    behind, 335, and where it did not follow tools at all 344.
+    The predictor follows body and tool: 228 iterations; 335 if it assumed the tool to be at rest,
+    and 344 without following tools at all.
     """
     steps, error = rotated_together(36)("newton")
     assert error < 1e-9

@@ -1,4 +1,4 @@
-"""Finite kinematics where they meet histories, files, cuts, free obstacles and error budgets."""
+"""Finite kinematics in histories, checkpoints, cuts, free obstacles and error budgets."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ HOW = {
 
 @pytest.mark.parametrize("how", HOW)
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_going_on_from_a_file(cell, how, tmp_path):
-    """Broken off while the tool turns, and taken up: the same digits on one rank, 1e-7 on more."""
+def test_restart(cell, how, tmp_path):
+    """A history restarted while the tool rotates has the same digits on one rank, 1e-7 on more."""
     options = {"n": (8, 4)} if cell == "triangle" else {}
     goes_on(lambda: Tool(cell, **options, **HOW[how]), shared_folder(tmp_path), stop=5)
 
 
-def test_a_file_of_another_kinematics_or_angle_is_refused(tmp_path):
-    """What was small cannot go on as finite; nor with the tool at another angle."""
+def test_checkpoint_of_other_kinematics_or_angle_is_refused(tmp_path):
+    """A restart with small displacements, or with another angle of the tool, is refused."""
     path = shared_folder(tmp_path) / "state.npz"
     law = fc.Frictionless(1e4)
     tool = Tool(n=(4, 2), law=law)
@@ -57,10 +57,10 @@ def test_a_file_of_another_kinematics_or_angle_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("shape", ["ball", "profile"])
-def test_first_touch_from_afar_in_increments_that_are_cut(shape):
-    """A disc half a block away comes down by 0.7 in one increment: cut until it is followed.
+def test_first_touch_across_a_large_gap_with_cut_increments(shape):
+    """A disc half a block away comes down by 0.7 in one increment, cut until it converges.
 
-    The end is that of 20 equal increments: without friction there is one answer. 1e-7.
+    Reference: the end of 20 equal increments, to 1e-7; without friction the solution is unique.
     """
     ends = []
     for steps in (1, 20):
@@ -75,8 +75,8 @@ def test_first_touch_from_afar_in_increments_that_are_cut(shape):
     assert close(ends[0], ends[1], 1e-7)
 
 
-def test_an_obstacle_that_a_force_presses_bears_it():
-    """N is the force, whatever the tool's angle, and the body follows the tool: 1e-8."""
+def test_free_obstacle_is_in_equilibrium_with_its_force():
+    """N is the force on the tool at any angle, to 1e-8, and the body follows the tool."""
     for cell in ("triangle", "tetrahedron"):
         tool = Tool(cell, force=True, **({"n": (8, 4)} if cell == "triangle" else {}))
         for step in tool.increments(2.0):
@@ -85,8 +85,8 @@ def test_an_obstacle_that_a_force_presses_bears_it():
         assert abs(r.force[0]) > 1.0
 
 
-def test_nothing_is_left_out_by_finite_kinematics():
-    """The error budget's line "kinematics" is 0, to round-off, and so is the verdict's."""
+def test_finite_kinematics_have_no_small_displacement_error():
+    """The error budget's part "kinematics" is 0, to round-off, and so is the verdict's error."""
     tool = Tool(n=(8, 4))
     for step in tool.increments(2.0):
         assert all(k.worst == 0.0 for k in step.verdict.small_displacement_error.values())
@@ -95,10 +95,10 @@ def test_nothing_is_left_out_by_finite_kinematics():
     assert all(abs(value) < 1e-12 for value in budget.parts["kinematics"].values())
 
 
-def test_the_budget_of_small_displacements_predicts_the_difference():
-    """What the verdict says that small displacements leave out is the difference of the two: 30 %.
+def test_small_displacement_error_is_that_to_finite_kinematics():
+    """The verdict's small-displacement error is the difference to finite kinematics: to 30 %.
 
-    A linear elastic block pressed into by a disc; both with the same springs.
+    A disc is pressed into a linear elastic block, with the same penalty in both cases.
     """
     found = {}
     for kinematics in ("small", "finite"):
@@ -124,11 +124,11 @@ def test_the_budget_of_small_displacements_predicts_the_difference():
 
 
 @pytest.mark.parametrize("shape", ["ball", "profile"])
-def test_the_form_in_a_problem_of_ones_own(shape):
-    """`Contact.form` and `tangent` in a Newton iteration written with DOLFINx alone: same u, 1e-9.
+def test_form_in_a_user_defined_problem(shape):
+    """`Contact.form` and `tangent` in a Newton iteration of DOLFINx alone give the same u, to 1e-9.
 
-    A hyperelastic body with friction, two increments; what is solved is F + contact.form(v). A
-    obstacle from data is sampled by `Contact.evaluate` wherever u has changed.
+    The body is hyperelastic, with friction, in two increments; the residual is F + contact.form(v).
+    An obstacle from data is sampled by `Contact.evaluate` whenever u has changed.
     """
     own, reference = (Tool("triangle", n=(8, 4), shape=shape) for _ in range(2))
     scene, contact = own.scene, own.contact

@@ -1,8 +1,8 @@
-"""Bulk forms as their users write them: over tags of every kind, of two materials, and in time.
+"""Bulk forms as users write them: over tags of every kind, of two materials, and in time.
 
-A form over tags is the same as one with coefficients by cell, to 1e-9: the solver's 1e-13 of the
-forces, with room for the tangent's condition. The stiffness of contact is the default, a multiple
-of E/h as it is measured in the form.
+A form over tags has the solution of one with coefficients by cell, to 1e-9: the solver's 1e-13 of
+the forces, with a margin for the condition of the tangent. The contact stiffness is the default, a
+multiple of E/h with the E derived from the form.
 """
 
 import basix.ufl
@@ -33,15 +33,15 @@ NU = 0.3
 
 
 class Layers:
-    """A block of two layers, its cells and facets tagged, which a pressure presses on a floor.
+    """A block of two layers with tagged cells and facets, pressed onto a floor by a pressure.
 
     Attributes:
-        dx, ds: Measures with the tags, and without.
-        E, pull: Coefficients by cell, whose form with plain measures is the reference.
+        dx, ds: Measures with the tags.
+        E, pull: Coefficients by cell; their form with measures without tags is the reference.
     """
 
     def __init__(self, element=None, **mesh_arguments):
-        """Make mesh, tags and functions; ``element``: of a mixed function."""
+        """Make mesh, tags and functions; ``element`` is that of a mixed function, if any."""
         self.mesh, self.facets = block_mesh("quadrilateral", n=4, **mesh_arguments)
         d = self.mesh.topology.dim
         cells = np.arange(self.mesh.topology.index_map(d).size_local, dtype=np.int32)
@@ -65,28 +65,28 @@ class Layers:
         self.pressure = fem.Constant(self.mesh, 2.0)
 
     def by_cell(self, values):
-        """A function of the tags of cells."""
+        """Return a DG-0 function with a value for each tag of cells."""
         f = fem.Function(fem.functionspace(self.mesh, ("DG", 0)))
         f.x.array[self.cells.indices] = [values[tag] for tag in self.cells.values]
         f.x.scatter_forward()
         return f
 
     def work(self, E):
-        """Density of the work of the stresses."""
+        """Return the density of the virtual work of the stresses."""
         return ufl.inner(stress(self.u, E, NU), strain(self.v))
 
     def loads(self, dx, ds):
-        """Work of the loads: a force on the upper layer, and the pressure on the top."""
+        """Return the virtual work of the force on the upper layer and the pressure on the top."""
         return PULL[UPPER] * self.v[0] * dx - self.pressure * self.v[1] * ds
 
     def plain(self, ds=None):
-        """The reference: no tags but those of the top, which there is no other way to say."""
+        """Return the reference form, with no tags except for the top, where they are needed."""
         ds = self.ds(TOP) if ds is None else ds
         F = self.work(self.E) * ufl.dx - self.pull * self.v[0] * ufl.dx
         return F + self.pressure * self.v[1] * ds
 
     def solved(self, F, law=None, **options):
-        """Displacements at the nodes, and k_n at the points of Γc."""
+        """Solve; return the displacements at the nodes, and k_n at the points of Γc."""
         if self.w is self.u:
             bcs = [hold(self.u, self.facets, LEFT, 0)]
         else:
@@ -104,7 +104,7 @@ class Layers:
 
 
 def two_measures_with_one_data(s):
-    """Each with its tag and its rule; the loads by a third."""
+    """Return a form over measures, each with a tag and a rule, and a third for the loads."""
     one, other = (
         ufl.Measure("dx", s.mesh, subdomain_data=s.cells, subdomain_id=tag, metadata=rule)
         for tag, rule in ((LOWER, {"quadrature_degree": 2}), (UPPER, {"quadrature_degree": 4}))
@@ -114,7 +114,7 @@ def two_measures_with_one_data(s):
 
 
 def pairs(s):
-    """Cells and facets as lists of (number, entities), as ``form`` of DOLFINx takes them."""
+    """Return a form over lists of (number, entities), as DOLFINx's ``form`` accepts them."""
     s.mesh.topology.create_connectivity(2, 1)
     to_cell, to_facet = s.mesh.topology.connectivity(1, 2), s.mesh.topology.connectivity(2, 1)
     behind = [(f, to_cell.links(f)[0]) for f in s.facets.find(TOP)]
@@ -129,12 +129,12 @@ def pairs(s):
 
 
 def two_materials(s, dx=None):
-    """By the tags of one measure."""
+    """Return the virtual work of the stresses of both materials, over the tags of one measure."""
     dx = s.dx if dx is None else dx
     return s.work(E[LOWER]) * dx(LOWER) + s.work(E[UPPER]) * dx(UPPER)
 
 
-# As they are met in scripts: name, and the form.
+# Forms as they occur in scripts, by name.
 WAYS = {
     "two materials": lambda s: two_materials(s) - s.loads(s.dx(UPPER), s.ds(TOP)),
     "without a mesh": lambda s: (
@@ -179,14 +179,14 @@ WAYS = {
 
 @pytest.mark.whole
 @pytest.mark.parametrize("way", WAYS)
-def test_ways_to_write_one_form(way):
-    """Each is the form with coefficients by cell."""
+def test_equivalent_forms_have_the_same_solution(way):
+    """Every form has the solution and k_n of that with coefficients by cell, to 1e-9."""
     s = Layers()
     u, k_n = s.solved(WAYS[way](s))
     reference = Layers()
     expected, stiffness = reference.solved(reference.plain())
     assert close(u, expected, 1e-9) and close(k_n, stiffness, 1e-9)
-    # Of the lower layer, on cells a quarter high; to the round-off of its smoothing.
+    # E of the lower layer, on cells of height 1/4; to the round-off of its smoothing.
     assert close(k_n, np.full(k_n.shape, 10 * E[LOWER] * 4), 1e-9)
 
 
@@ -198,8 +198,8 @@ VECTOR, SCALAR = (
 
 @pytest.mark.whole
 @pytest.mark.parametrize("parts", [(VECTOR, SCALAR), (SCALAR, VECTOR)], ids=["u, p", "p, u"])
-def test_two_materials_beside_a_pressure(parts):
-    """Of a mixed function, wherever the displacement is in it: E is 3 G."""
+def test_two_materials_in_a_mixed_form(parts):
+    """Displacement and pressure of a mixed function, in any order, over tags: E is 3 G, 1e-9."""
     element = basix.ufl.mixed_element(parts)
     found = []
     for tagged in (True, False):
@@ -221,8 +221,8 @@ def test_two_materials_beside_a_pressure(parts):
     assert close(k_n, np.full(k_n.shape, 10 * 3 * E[LOWER] / (2 * (1 + NU)) * 4), 1e-9)
 
 
-def test_two_rubbers():
-    """A nonlinear bulk over tags, with a rule of its own for each."""
+def test_two_nonlinear_materials():
+    """A nonlinear bulk over tags with their own rules, against coefficients by cell, 1e-9."""
     found = []
     for tagged in (True, False):
         s = Layers()
@@ -246,10 +246,10 @@ def test_two_rubbers():
 
 
 @pytest.mark.parametrize("kind", ["cells", "facets"])
-def test_rules_of_their_own_over_the_same_tags(kind):
-    """Two rules over a tag, one of them over several at once: both count.
+def test_two_quadrature_rules_over_the_same_tags(kind):
+    """Two quadrature rules over a tag, one of them over several tags at once, are both assembled.
 
-    DOLFINx 0.9 assembles one of them as one form, and is silent: of residual, tangent and E.
+    In one form, DOLFINx 0.9 silently assembles one of them, in residual, tangent and E.
     """
     found = []
     for tagged in (True, False):
@@ -272,7 +272,7 @@ def test_rules_of_their_own_over_the_same_tags(kind):
 
 
 def test_joined_bodies():
-    """A material for each body over ``joined.body``, two bodies in contact, against `by_body`."""
+    """Two bodies in contact, with materials over ``joined.body``, against `by_body`, 1e-9."""
     found = []
     for tagged in (True, False):
         lower, upper = (block_mesh("quadrilateral", n=n) for n in (2, 3))
@@ -309,8 +309,8 @@ def test_joined_bodies():
     assert close(u, expected, 1e-9) and close(k_n, stiffness, 1e-9)
 
 
-def test_jumps_beside_tagged_cells():
-    """Integrals over interior facets have tags of their own, or none."""
+def test_interior_facets_with_tagged_cells():
+    """Integrals over interior facets need no tags if those over cells have tags, 1e-9."""
     found = []
     for tagged in (True, False):
         s = Layers(ghost_mode=dolfinx.mesh.GhostMode.shared_facet)
@@ -322,8 +322,8 @@ def test_jumps_beside_tagged_cells():
 
 
 @pytest.mark.parametrize("kind", ["dx", "ds"])
-def test_two_objects_of_tags(kind):
-    """DOLFINx takes one for each kind of measure: said in words, before anything is compiled."""
+def test_two_tag_objects_for_one_kind_of_measure_are_refused(kind):
+    """Two tag objects for one kind of measure, of which DOLFINx accepts one, raise an error."""
     s = Layers()
     tags = s.cells if kind == "dx" else s.facets
     copy = dolfinx.mesh.meshtags(s.mesh, tags.dim, tags.indices, tags.values)
@@ -333,8 +333,8 @@ def test_two_objects_of_tags(kind):
     raised_everywhere(lambda: s.solved(F), ValueError, f"integrals over {kind} with two different")
 
 
-def test_tags_of_other_entities():
-    """Those of facets for cells, and those of another mesh: DOLFINx says a number, or nothing."""
+def test_tags_of_other_entities_or_meshes_are_refused():
+    """Facet tags for cells, or tags of another mesh, are named; DOLFINx gives a code or nothing."""
     s, other = Layers(), Layers()
     F = s.plain() + s.v[0] * ufl.Measure("dx", s.mesh, subdomain_data=s.facets)(TOP)
     raised_everywhere(lambda: s.solved(F), ValueError, f"dx({TOP})", "dimension 1", "on the cells")
@@ -342,8 +342,8 @@ def test_tags_of_other_entities():
     raised_everywhere(lambda: s.solved(F), ValueError, f"dx({UPPER})", "another mesh")
 
 
-def test_a_tag_without_tags_beside_tagged_cells():
-    """A measure without tags is named, whatever others have."""
+def test_subdomain_of_a_measure_without_tags_is_refused():
+    """An integral over a subdomain without tags is named, even if other measures have tags."""
     s = Layers()
     F = WAYS["two materials"](s) + s.v[0] * ufl.dx(s.mesh)(UPPER)
     raised_everywhere(lambda: s.solved(F), ValueError, f"an integral over dx({UPPER})", "no tags")
@@ -355,12 +355,12 @@ DENSITY, BETA, GAMMA = 2.0, 0.25, 0.5
 
 
 def newmark(u, v, dt):
-    """Acceleration and velocity at the end of a time step that begins at rest (UFL)."""
+    """Return acceleration and velocity (UFL) at the end of a time step that starts at rest."""
     return u / (BETA * dt**2), GAMMA * u / (BETA * dt)
 
 
 def bulks(kind, mesh, u, v):
-    """Work of the stresses of the lower layer's modulus, and what its integrals carry."""
+    """Return the residual with the lower layer's modulus, and the weight of its integrals."""
     if kind == "rubber":
         rubber = NeoHookean(u, E[LOWER], NU, "plane strain")
         return rubber.residual(v), rubber.weight
@@ -370,11 +370,11 @@ def bulks(kind, mesh, u, v):
 
 @pytest.mark.whole
 @pytest.mark.parametrize("kind", ["plane strain", "axisymmetric", "3D", "rubber"])
-def test_inertia_is_no_stiffness(kind):
-    """E in a form by Newmark's method is that of the material at any time step: 1e-9, round-off.
+def test_inertia_is_not_counted_as_stiffness(kind):
+    """E derived from a form by Newmark's method is that of the material: 1e-9, round-off.
 
-    Beside mass there are damping by velocity, a foundation, and a term of first order. Mass is from
-    1e-12 to 1e18 times as large as stiffness; as part of E it had been 12 % and -30 %.
+    The form has mass, viscous damping, an elastic foundation and a first-order term. Mass is from
+    1e-12 to 1e18 times as large as stiffness; it once changed E by 12 % and -30 %.
     """
     mesh, tags = block_mesh("tetrahedron" if kind == "3D" else "triangle", n=2)
     d = mesh.geometry.dim
@@ -395,12 +395,12 @@ def test_inertia_is_no_stiffness(kind):
         )
         fc.ContactProblem(F, u, contacts=[contact])
         found.append(at_points(contact, contact.values.parameters["k_n"]))
-    # A cell is half of the block high.
+    # The height of a cell is half of that of the block.
     assert close(found, np.full_like(found, 5.0 * E[LOWER] * 2), 1e-9)
 
 
-def test_inertia_beside_a_pressure():
-    """The same of a mixed function, whose E is 3 G."""
+def test_inertia_in_a_mixed_form():
+    """E derived from a mixed form with inertia is 3 G, 1e-9."""
     s = Layers(basix.ufl.mixed_element([VECTOR, SCALAR]))
     dt, G = fem.Constant(s.mesh, 1e-5), E[LOWER] / (2 * (1 + NU))
     F = 2 * G * ufl.inner(strain(s.u), strain(s.v)) * ufl.dx - s.p * ufl.div(s.v) * ufl.dx

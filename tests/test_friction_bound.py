@@ -1,4 +1,4 @@
-"""The friction bound: all that a law says of the strength of friction, c + μ p and μ(Δu_t) p."""
+"""Tests of laws with friction bounds of their own: c + μ p and μ(Δu_t) p."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 MU, COHESION, RATE = 0.3, 1.0, 2.0
-# A low block that hardly deforms, on an area of 1 in the plane: tractions are nearly even, and a
-# pull at its top leaves all of Γc closed.
+# A low, stiff block on an area of 1 in the plane: tractions are nearly uniform, and a force at its
+# top leaves all of Γc closed.
 LOW = {"E": 1e8, "size": (1.0, 0.1), "n": 4}
 
 
@@ -33,7 +33,7 @@ class Cohesive(fc.Coulomb):
     cohesion: Any = 0.0
 
     def friction_bound(self, kinematics, pressure, parameters):
-        """As the page on laws of one's own has it."""
+        """Return c + μ p, as the page on user-defined laws does."""
         return parameters["cohesion"] + parameters["friction"] * pressure
 
 
@@ -44,13 +44,13 @@ class Strengthening(fc.Coulomb):
     rate: Any = 0.0
 
     def friction_bound(self, kinematics, pressure, parameters):
-        """As the page on laws of one's own has it."""
+        """Return (μ + a |Δu_t|) p, as the page on user-defined laws does."""
         distance = norm(kinematics.tangential_increment)
         return (parameters["friction"] + parameters["rate"] * distance) * pressure
 
 
 def low_block(law, side, cell="quadrilateral", **options):
-    """A block under its weight of 1, pulled along the floor by a force on its top."""
+    """Return problem and contact of a block of weight 1, pulled along the floor at its top."""
     size = {"size": (1.0, 1.0, 0.1), "n": (2, 2, 1)} if cell == "hexahedron" else {}
     scene = block(cell, up=-1.0, side=side, **(LOW | size))
     return scene.problem(law, [], **options)
@@ -60,10 +60,10 @@ def low_block(law, side, cell="quadrilateral", **options):
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
-def test_cohesion_bears_without_pressure(cell):
-    """With c on an area of 1 and the weight N = 1 the floor bears c + μ N = 1.3: 1.25 is solved.
+def test_cohesion_adds_to_the_friction_limit(cell):
+    """With c on an area of 1 and weight N = 1 the friction limit is c + μ N = 1.3: 1.25 is solved.
 
-    The tangential force is the load, to the solver's 1e-9 of the forces.
+    The tangential force is the load, to 1e-7; the solver stops at 1e-9 of the forces.
     """
     law = Cohesive(MU, k_n=1e5, k_t=1e5, cohesion=COHESION)
     problem, _ = low_block(law, 1.25, cell)
@@ -72,8 +72,8 @@ def test_cohesion_bears_without_pressure(cell):
     assert step.contacts["contact"].force[0] == pytest.approx(-1.25, rel=1e-7)
 
 
-def test_more_than_cohesion_bears_is_an_overload():
-    """What the floor bears, 1.3, is in the message, though no point's friction is μ p."""
+def test_load_above_the_limit_with_cohesion_is_an_overload():
+    """The error states the friction limit, 1.3, although the friction bound is not μ p."""
     law = Cohesive(MU, k_n=1e5, k_t=1e5, cohesion=COHESION)
     problem, _ = low_block(law, 1.35)
     raised_everywhere(problem.solve, fc.NotConverged, "overload", "at most 1.3")
@@ -100,8 +100,11 @@ RATIOS = {
 
 @pytest.mark.whole
 @pytest.mark.parametrize("name", RATIOS)
-def test_what_bounds_tangential_forces_follows_from_the_friction_bound(name):
-    """μ times the shape of the yield surface where the bound is μ p; else nothing does."""
+def test_friction_bound_ratio_follows_from_the_friction_bound(name):
+    """The ratio is μ times the shape of the yield surface if the bound is μ p, else infinite.
+
+    It is zero without friction. The tolerance is 1e-14.
+    """
     law, expected = RATIOS[name]
     contact = block("hexahedron", n=1).contact(law)
     contact.evaluate()
@@ -111,8 +114,8 @@ def test_what_bounds_tangential_forces_follows_from_the_friction_bound(name):
     )
 
 
-def test_a_yield_surface_of_ones_own_denies_no_balance():
-    """Friction twice as strong to one side, by its own yield functions, bears 0.5 N there."""
+def test_asymmetric_yield_surface_is_not_refused_as_overload():
+    """With yield functions twice as large to one side, a load of 0.5 N is solved there only."""
 
     @dataclass(frozen=True)
     class OneSided(fc.Coulomb):
@@ -151,10 +154,10 @@ def test_a_yield_surface_of_ones_own_denies_no_balance():
 
 @pytest.mark.parametrize("method", [None, "newton"])
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
-def test_friction_by_the_slip_distance(cell, method):
-    """A force T > μ N drags the block by (T/N - μ)/a in every increment.
+def test_friction_coefficient_that_grows_with_the_slip_distance(cell, method):
+    """A force T > μ N moves the block by (T/N - μ)/a in every increment, to 1e-4.
 
-    No friction of μ alone bears it. The block's own deformation is some 1e-6 of the way.
+    It is above the limit for constant μ. The block's deformation is some 1e-6 of the slip distance.
     """
     law = Strengthening(MU, k_n=1e6, k_t=1e6, rate=RATE)
     problem, contact = low_block(law, 0.4, cell, method=method)
@@ -168,8 +171,8 @@ def test_friction_by_the_slip_distance(cell, method):
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
-def test_the_tangent_has_the_slip_distance(cell, kinematics):
-    """Tractions and their derivative at the points: central differences, to 1e-6."""
+def test_tangent_includes_the_derivative_by_the_slip_distance(cell, kinematics):
+    """The tangent at the points agrees with central differences of the tractions to 1e-6."""
     scene = block(cell, n=2, E=1e3, shuffled=True)
     law = Strengthening(MU, k_n=2e3, k_t=1e3, rate=RATE)
     contact = scene.contact(law, kinematics=kinematics)

@@ -1,6 +1,6 @@
-"""Results as functions on Γc, for forms of the user's own and for files.
+"""Tests of results as functions on Γc, for user-defined forms and for files.
 
-References: integrals over the points themselves, which linear functions on flat facets keep to
+References: sums over the quadrature points, which linear functions on flat facets reproduce to
 round-off (1e-12 of the largest), and the range of the values there.
 """
 
@@ -28,8 +28,8 @@ pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
 @pytest.mark.parametrize("cell", CELLS)
-def test_integrals_are_those_of_the_points(cell):
-    """In forms over the body's mesh, on facets of all orientations; nothing leaves its range."""
+def test_integrals_equal_sums_over_quadrature_points(cell):
+    """Forms on the body's mesh have facets of all orientations; nodal values remain in range."""
     made = Rub(cell=cell, degree=2, mesh={"n": 4, "shuffled": True})
     made.problem.small_displacement_tolerance = np.inf
     list(fc.increments(made.problem, made.load, 0, 2, steps=2))
@@ -60,8 +60,8 @@ def test_integrals_are_those_of_the_points(cell):
     assert close(assemble_number(compiled(pressure * ds, contact), COMM), force, 1e-12)
 
 
-def test_a_form_that_is_compiled_once():
-    """The same function takes the values of the next state."""
+def test_compiled_form_takes_updated_values():
+    """A function in a form that is compiled once takes the values of the next state (1e-12)."""
     made = Rub(mesh={"n": 4})
     made.problem.small_displacement_tolerance = np.inf
     contact = made.contact
@@ -76,8 +76,8 @@ def test_a_form_that_is_compiled_once():
     assert COMM.allreduce(np.max(slip.x.array, initial=0.0), op=MPI.MAX) > 0
 
 
-def test_files(tmp_path):
-    """A gap that is the same everywhere, at every node; and DOLFINx writes such functions."""
+def test_uniform_gap_is_exact_and_can_be_written(tmp_path):
+    """A uniform gap has its value at every node (1e-12), and DOLFINx writes the function."""
     scene = block("tetrahedron", n=3)
     obstacle = fc.PrescribedGap(0.1, scene.vector(up=-1.0))
     gap = scene.contact(fc.Frictionless(1e3), obstacle=obstacle).function("gap")
@@ -90,8 +90,8 @@ def test_files(tmp_path):
     assert path.exists()
 
 
-def test_bad_input():
-    """Named, on all ranks."""
+def test_wrong_arguments_are_named():
+    """Errors name the wrong argument on all ranks."""
     scene = block("triangle")
     contact = scene.contact(fc.Frictionless(1e3))
     raised_everywhere(lambda: contact.function("heat"), ValueError, "'heat'", "'pressure'")

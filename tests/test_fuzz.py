@@ -1,4 +1,4 @@
-"""Random scenes compared with the independent solver, and tests of this solver and comparison.
+"""Tests of random scenes against an independent solver, of that solver and of the comparison.
 
 Tolerances of the comparison are those of ``verification/fuzz_judge.py``.
 """
@@ -46,7 +46,7 @@ FINE = ("right", "another", "refused")
 
 
 def solve(scene, **options):
-    """Outcome of a scene, on all ranks."""
+    """Return the outcome of a scene on all ranks."""
     outcome = fuzz.run_scene(copy.deepcopy(scene), COMM if COMM.size > 1 else None, **options)
     return COMM.bcast(outcome)
 
@@ -72,7 +72,7 @@ FINITE = [*SCENES["finite"], *SCENES["bodies"]]
 @pytest.mark.mpi
 @pytest.mark.parametrize("number", range(len(FINITE)))
 def test_scenes_of_finite_kinematics_are_right(number):
-    """Moving and rotating obstacles, linear bodies and rubber, two bodies."""
+    """Scenes have moving and rotating obstacles, linear and rubber bodies, or two bodies."""
     if COMM.size > 1 and number % 4:
         pytest.skip("takes longer on several ranks")
     scene = FINITE[number]
@@ -85,8 +85,8 @@ def test_scenes_of_finite_kinematics_are_right(number):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("seed", [720024, 720031, 720034, 720046])
-def test_a_body_between_two_others_is_positioned(seed):
-    """A block between a moved one and a cavity is unconstrained until both are in contact.
+def test_body_between_two_others_is_positioned(seed):
+    """A block between a moved block and a cavity is unconstrained until it touches both.
 
     Without load any position between them is an equilibrium.
     """
@@ -97,7 +97,7 @@ def test_a_body_between_two_others_is_positioned(seed):
 
 
 @serial
-def test_methods_are_tried_on_a_refused_scene(monkeypatch):
+def test_methods_are_tried_in_turn_on_a_refused_scene(monkeypatch):
     """The methods are tried one after another, until one has a correct solution."""
     asked = []
 
@@ -113,8 +113,8 @@ def test_methods_are_tried_on_a_refused_scene(monkeypatch):
 
 
 @serial
-def test_an_iteration_without_progress_is_no_solution():
-    """Where it stops nearly a hundredth of the forces is not in balance."""
+def test_stalled_iteration_is_refused():
+    """Newton's method stalls at a residual of nearly 1e-2 of the forces; other methods fail too."""
     name = "a factorisation that failed, followed by another"
     scene = next(e["scene"] for e in SCENES["regressions"] if e["name"] == name)
     outcome = solve(scene | {"method": "newton"})
@@ -127,8 +127,8 @@ def test_an_iteration_without_progress_is_no_solution():
 
 @serial
 @pytest.mark.parametrize("method", [None, "newton", "lbfgs", "continuation"])
-def test_no_method_refuses_what_others_solve(method):
-    """By default it was refused as an overload, before the methods that solve it were tried."""
+def test_every_method_solves_obstacle_constrained_by_pressure(method):
+    """The scene must not be refused as an overload before the methods that solve it are tried."""
     name = "an obstacle constrained by a prescribed pressure alone"
     scene = next(e["scene"] for e in SCENES["regressions"] if e["name"] == name)
     assert solve(scene | ({"method": method} if method else {})).outcome == "right"
@@ -136,7 +136,7 @@ def test_no_method_refuses_what_others_solve(method):
 
 @serial
 def test_most_scenes_are_solved_and_compared():
-    # Refusing everything, or comparing nothing, would pass the test above.
+    # If all scenes were refused, or none compared, test_scenes_are_not_wrong would pass.
     found = [(scene["seed"], solve(scene)) for scene in SCENES["scenes"][::7]]
     solved = [(seed, o) for seed, o in found if o.outcome in ("right", "another")]
     assert len(solved) > 0.7 * len(found)
@@ -150,15 +150,15 @@ def test_most_scenes_are_solved_and_compared():
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("entry", REGRESSIONS)
-def test_scenes_that_were_wrong(entry):
+def test_formerly_wrong_scenes_are_not_wrong(entry):
     outcome = solve(entry["scene"])
     assert outcome.outcome in entry.get("allowed", FINE), outcome
 
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("form", fuzz_scenes.FORMS[1:])
-def test_equivalent_bulk_forms(form):
-    """Two materials, linear and rubber, in every form: compared with piecewise constant E."""
+def test_equivalent_bulk_forms_are_right(form):
+    """Every form of two materials, linear or rubber, agrees with piecewise constant E."""
     if COMM.size > 1 and form not in ("pairs", "beside"):
         pytest.skip("takes longer on several ranks")
     linear = next(s for s in SCENES["scenes"] if s["seed"] == 600052) | {"weight": 0.1}
@@ -202,7 +202,7 @@ ONE = {
 
 
 @serial
-def test_a_correct_scene_is_right():
+def test_correct_scene_is_right():
     assert solve(ONE).outcome == "right"
 
 
@@ -233,14 +233,14 @@ def _more_work(record):
         (_more_work, "energy work"),
     ],
 )
-def test_a_wrong_result_is_detected(perturb, check):
+def test_wrong_result_is_detected(perturb, check):
     outcome = solve(ONE, perturb=perturb)
     assert outcome.outcome == "wrong"
     assert check in outcome.kind
 
 
 def change_history(change):
-    """A modification that changes the history after every commit."""
+    """Return a modification that changes the history after every commit."""
 
     def modify(setup, problem):
         commit, history = problem.commit, problem.contacts[0].history
@@ -260,14 +260,14 @@ def _reduce_traction(history):
 
 
 @serial
-def test_a_wrong_history_is_detected():
+def test_wrong_history_is_detected():
     outcome = solve(ONE, modify=change_history(_reduce_traction))
     assert outcome.outcome == "wrong"
     assert "equations" in outcome.kind
 
 
 @serial
-def test_a_wrong_friction_coefficient_is_detected():
+def test_wrong_friction_coefficient_is_detected():
     def modify(setup, problem):
         setup.scene = copy.deepcopy(setup.scene)
         setup.scene["contacts"][0]["law"]["friction"] = 0.3003
@@ -324,7 +324,7 @@ FAR = pytest.mark.parametrize("scene", [TURNING, TWO], ids=["obstacle", "bodies"
 
 @serial
 @FAR
-def test_a_correct_scene_with_finite_kinematics_is_right(scene):
+def test_correct_scene_with_finite_kinematics_is_right(scene):
     assert solve(scene).outcome == "right"
 
 
@@ -339,8 +339,8 @@ def _shift_slip_reference(history):
 @serial
 @FAR
 @pytest.mark.parametrize("change", [_exchange_components, _shift_slip_reference])
-def test_a_wrong_history_with_finite_kinematics_is_detected(change, scene):
-    """The traction with exchanged components; a slip reference shifted by 1e-6."""
+def test_wrong_history_with_finite_kinematics_is_detected(change, scene):
+    """Exchanged traction components, or a slip reference shifted by 1e-6, are detected."""
     outcome = solve(scene, modify=change_history(change))
     assert outcome.outcome == "wrong"
     assert "equations" in outcome.kind
@@ -362,7 +362,7 @@ LOOSE["contacts"][0]["quadrature"] = 5
 
 
 @serial
-def test_a_positioned_body_is_right():
+def test_correct_positioning_is_right():
     outcome = solve(LOOSE)
     assert outcome.outcome == "right"
     assert {"positioning rigid", "positioning depth", "positioning gap", "independent"} <= set(
@@ -397,7 +397,7 @@ def test_wrong_positioning_is_detected(change, check):
 
 
 @serial
-def test_a_traction_that_is_not_rotated_is_detected():
+def test_traction_that_is_not_rotated_is_detected():
     """The committed traction remains fixed in space while both bodies rotate."""
 
     def modify(setup, problem):
@@ -411,8 +411,8 @@ def test_a_traction_that_is_not_rotated_is_detected():
 
 @serial
 @pytest.mark.parametrize("what", ["angle", "shift"])
-def test_a_wrong_obstacle_position_is_detected(what):
-    """It rotates or moves by a thousandth more than the scene prescribes."""
+def test_wrong_obstacle_position_is_detected(what):
+    """An obstacle that rotates or moves by 0.1 % more than prescribed is detected."""
 
     def modify(setup, problem):
         apply, value = setup.apply, getattr(setup, what)
@@ -429,8 +429,8 @@ def test_a_wrong_obstacle_position_is_detected(what):
 @pytest.mark.whole
 @serial
 @pytest.mark.parametrize("kind", finite_scenes.KINDS)
-def test_gap_functions_of_the_independent_solver(kind):
-    """The gradient is minus the unit normal: finite differences, 1e-6, near the lowest vertex."""
+def test_gap_gradients_of_the_independent_solver(kind):
+    """Gap gradients are minus the unit normal (finite differences near the lowest vertex, 1e-6)."""
     for d in (2, 3):
         if d == 2 and kind in ("torus", "turned profile"):
             continue
@@ -482,7 +482,7 @@ PLATE["contacts"][0]["obstacle"] = {
 
 
 def _through():
-    """The plate moves 0.3 through the bottom of the block."""
+    """Return a scene whose plate moves by 0.3 through the bottom of the block."""
     scene = copy.deepcopy(PLATE)
     scene["stages"][0]["normal"] = 300.0
     return scene
@@ -490,13 +490,13 @@ def _through():
 
 @serial
 @pytest.mark.parametrize("unrelated", fuzz_features.UNRELATED_BODIES)
-def test_a_scene_with_an_unrelated_body_is_right(unrelated):
+def test_scene_with_an_unrelated_body_is_right(unrelated):
     assert solve(ONE | {"unrelated_body": unrelated}).outcome == "right"
 
 
 @serial
 @pytest.mark.parametrize("scene", [ONE, TURNING, TWO], ids=["small", "obstacle", "bodies"])
-def test_a_translated_scene_is_right(scene):
+def test_translated_scene_is_right(scene):
     carried = copy.deepcopy(scene) | {"translation": [20.0, 5.0]}
     if scene is not TWO:
         carried["contacts"][0]["obstacle"].setdefault("moving", "translated")
@@ -504,14 +504,14 @@ def test_a_translated_scene_is_right(scene):
 
 
 @serial
-def test_a_plate_that_passes_through_is_refused():
+def test_plate_that_passes_through_a_facet_is_refused():
     assert solve(PLATE).outcome == "right"
     assert solve(_through()).outcome == "refused"
 
 
 @serial
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_an_undetected_plate_is_found(kinematics, monkeypatch):
+def test_comparison_detects_tunnelling_of_a_plate(kinematics, monkeypatch):
     monkeypatch.setattr(TunnellingCheck, "evaluate", lambda self, before: {})
     scene = _through()
     if kinematics == "finite":
@@ -523,8 +523,8 @@ def test_an_undetected_plate_is_found(kinematics, monkeypatch):
 
 
 @serial
-def test_an_undetected_body_is_found(monkeypatch):
-    """The block penetrates the slab by 0.5, between the two points of its top."""
+def test_comparison_detects_penetration_of_a_body(monkeypatch):
+    """The block penetrates the slab by 0.5 between the two quadrature points of the slab's top."""
     monkeypatch.setattr(TunnellingCheck, "evaluate", lambda self, before: {})
     scene = copy.deepcopy(TWO)
     scene["contacts"][0]["obstacle"] |= {"body": 1, "side": "bottom"}
@@ -538,7 +538,7 @@ def test_an_undetected_body_is_found(monkeypatch):
 
 @serial
 def test_large_motion_with_small_kinematics_is_detected():
-    """A disc pressed against the block moves sideways with it, by its radius."""
+    """A disc pressed against the block moves sideways with it, by half its radius."""
     scene = copy.deepcopy(ONE) | {"translation": [0.5, 0.0]}
     obstacle = {"kind": "ball", "clearance": 0.0, "radius": 1.0, "moving": "translated"}
     scene["contacts"][0]["obstacle"] = obstacle
@@ -570,8 +570,8 @@ def test_seeds_reproduce_and_features_can_be_left_out():
 
 
 @serial
-def test_dissimilar_bodies_change_nothing_else():
-    """Ratios of facet widths up to 20, with rounding 24, and of moduli from 1e3 to 1e6."""
+def test_extreme_scenes_differ_in_their_bodies_only():
+    """Ratios are up to 20 for facet widths (24 with rounding), and 1e3 to 1e6 for moduli."""
     ratios = []
     for seed in range(60):
         plain, unlike = (sliding_scenes.draw(seed, extreme=e) for e in (False, True))
@@ -586,7 +586,7 @@ def test_dissimilar_bodies_change_nothing_else():
 
 
 @serial
-def test_minimise_removes_what_does_not_matter():
+def test_minimise_removes_irrelevant_features():
     scene = copy.deepcopy(ONE) | {"method": "newton", "units": [1e3, 1e-3], "weight": 0.1}
     scene["contacts"][0]["gap"] = -0.001
     found = fuzz.minimise(scene, lambda s: "gap" in s["contacts"][0])
@@ -600,7 +600,7 @@ def test_minimise_removes_what_does_not_matter():
 
 @pytest.mark.slow
 @serial
-def test_a_campaign_can_be_resumed(tmp_path):
+def test_campaign_can_be_resumed(tmp_path):
     path = tmp_path / "results.csv"
     script = ROOT / "verification" / "fuzz.py"
     base = [sys.executable, str(script), "--resume", str(path), "--without", "space"]
@@ -625,8 +625,8 @@ def test_a_campaign_can_be_resumed(tmp_path):
 
 
 @serial
-def test_page_of_campaigns_follows_from_stored_outcomes():
-    """The page in docs/ is that of the stored outcomes."""
+def test_campaign_page_agrees_with_stored_outcomes():
+    """The page in docs/ equals the one generated from the stored outcomes."""
     assert campaigns.page(campaigns.campaigns()) == campaigns.PAGE.read_text()
 
 
@@ -634,7 +634,7 @@ def test_page_of_campaigns_follows_from_stored_outcomes():
 
 
 def point_spring():
-    """One node on unit springs above a floor: two dofs."""
+    """Return a problem of one node on unit springs above a floor (two dofs)."""
     body = reference_geometry.Body(
         cell="triangle",
         degree=1,
@@ -660,7 +660,7 @@ def point_spring():
 
 
 @serial
-def test_reference_follows_the_history_of_a_point():
+def test_reference_reproduces_load_history_of_a_point():
     # Code_Aster SSND116A; displacements printed to six digits.
     problem = point_spring()
     u, motion, old = np.zeros(2), np.zeros(0), [problem.contacts[0].initial_state()]
@@ -718,7 +718,7 @@ def test_reference_passes_the_patch_test(cell, degree):
 
 @serial
 @pytest.mark.parametrize("modes", [3, 4, 6, 8])
-def test_reference_returns_to_the_nearest_point_of_a_polygon(modes):
+def test_reference_projects_onto_nearest_point_of_polygon(modes):
     # σ is nearest to σ* in a convex set if (σ* - σ)·(v - σ) ≤ 0 for all corners v.
     rng = np.random.default_rng(1)
     trial, limit = rng.normal(size=(200, 2)), rng.uniform(0.1, 2, 200)
@@ -734,7 +734,7 @@ def test_reference_returns_to_the_nearest_point_of_a_polygon(modes):
 
 
 @serial
-def test_reference_derivatives_are_those_of_differences():
+def test_reference_derivatives_agree_with_finite_differences():
     law = reference_laws.Law("coulomb", friction=0.4, transverse=0.2, direction=(1.0, 0.3, 0.0))
     rng = np.random.default_rng(3)
     n = 20

@@ -1,4 +1,4 @@
-"""The closed form and the committed history against numbers made in numpy, and a known spring."""
+"""Return map and committed history against numpy, and a benchmark with contact springs."""
 
 from dataclasses import dataclass
 
@@ -17,13 +17,13 @@ pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
 
 K_N, K_T, FRICTION = 100.0, 60.0, 0.3
-# The return map is some twenty operations on numbers of size one at each point.
+# Round-off of the return map: some twenty operations on numbers of size one at each point.
 EXACT = 1e-12
 
 
 @dataclass
 class PointLaw:
-    """The paper's return map (eq. 6-11, 41-45) at every point, history included, in numpy alone.
+    """The paper's return map (eq. 6-11, 41-45) with its history at every point, in plain numpy.
 
     Attributes:
         s: Initial gap, shape (n,).
@@ -38,15 +38,15 @@ class PointLaw:
     beta: np.ndarray
 
     def along(self, u: np.ndarray) -> np.ndarray:
-        """u_n, shape (n,)."""
+        """Return the normal displacement u_n, shape (n,)."""
         return np.sum(u * self.normal, axis=1)
 
     def tangential(self, u: np.ndarray) -> np.ndarray:
-        """u_t, shape (n, d)."""
+        """Return the tangential displacement u_t, shape (n, d)."""
         return u - self.along(u)[:, None] * self.normal
 
     def step(self, u: np.ndarray, mu: float, k_n: float, k_t: float) -> dict[str, np.ndarray]:
-        """Fields at the end of an increment to displacement ``u``; the history stays."""
+        """Return the fields after an increment to ``u``; the history does not change."""
         opening = np.maximum(self.s - self.along(u), 0)
         penetration = np.maximum(self.along(u) - self.s, 0)
         closed = penetration > 0
@@ -69,7 +69,7 @@ class PointLaw:
         tau = np.where(closed[:, None], tau, 0)
         stick = closed & np.all(beta == 0, axis=1)
         status = np.where(closed, np.where(stick, fc.Status.STICK, fc.Status.SLIP), fc.Status.OPEN)
-        # Distance of the nearest point to a change of status: none may be decided by rounding.
+        # Smallest distance of a point to a change of status: must be above round-off.
         kinks = np.concatenate([opening + penetration, np.abs(g[closed]).ravel() / k_t])
         return {
             "opening": opening,
@@ -82,14 +82,14 @@ class PointLaw:
         }
 
     def commit(self, u: np.ndarray, fields: dict[str, np.ndarray]) -> None:
-        """Make the fields of a step the history."""
+        """Make the fields of an increment the history."""
         self.tau, self.u = fields["traction"], u
         self.beta = self.beta + fields["slip_increment"]
 
 
-# Approach in part, stick, slip, a little back, slip the other way, open, travel while open, close,
-# slip again: displacement along the normal and across it (in space in two directions), and what
-# has to be found somewhere.
+# Partial approach, stick, slip, small reversal, reversed slip, opening, motion while open, closing,
+# slip: displacement along the normal and tangential to it (in 3D in two directions), and statuses
+# that some points must have.
 OPEN, STICK, SLIP = fc.Status.OPEN, fc.Status.STICK, fc.Status.SLIP
 PATH = [
     (0.075, (0.0, 0.0), {OPEN}),
@@ -106,10 +106,10 @@ PATH = [
 
 
 class Scene:
-    """Γc over two sides of a shuffled mesh; gap and normal vary, given by UFL and by numpy."""
+    """Γc on two sides of a shuffled mesh, with varying gap and normal in UFL and numpy."""
 
     def __init__(self, cell: str, degree: int) -> None:
-        """Make the contact; u is zero."""
+        """Create the contact; u is zero."""
         self.d = d = dimension(cell)
         self.degree = degree
         mesh, tags = block_mesh(cell, shuffled=True)
@@ -125,7 +125,7 @@ class Scene:
         self.x = gathered(COMM, self.contact.points)
 
     def reference(self) -> PointLaw:
-        """The same gap and normal in numpy, without history."""
+        """Return the return map in numpy with this gap and normal, without history."""
         x, d = self.x, self.d
         s = 0.08 + 0.03 * x[:, 0] ** 2 - 0.01 * x[:, -1]
         normal = [0.3 * x[:, 0] - 0.1, *([0.2 * x[:, 1]] if d == 3 else []), 0 * s - 1.5]
@@ -135,7 +135,7 @@ class Scene:
         return PointLaw(s, normal, np.zeros_like(x), np.zeros_like(x), np.zeros((len(x), m)))
 
     def displacement(self, number: int):
-        """The field of an increment: a mean and a polynomial that the element represents."""
+        """Return an increment's displacement: a mean and a polynomial of the element's degree."""
         along, across, _ = PATH[number]
         mean = np.zeros(self.d)
         mean[:-1], mean[-1] = across[: self.d - 1], -along
@@ -144,11 +144,11 @@ class Scene:
 
 
 @pytest.mark.parametrize(("cell", "degree"), GRID)
-def test_history_is_exact(cell, degree):
-    """Ten increments equal the point-by-point return map in numpy, at every point of every rank.
+def test_history_equals_the_return_map_in_numpy(cell, degree):
+    """Ten increments equal the pointwise return map in numpy, at all points of all ranks.
 
-    Traction, δ₊, δ₋, Δβ and β of each mode, status. Reference: `PointLaw` on analytic
-    displacements of the points' coordinates. Tolerance 1e-12 of the largest value: round-off.
+    Compared are traction, δ₊, δ₋, Δβ and β of each mode, and status. Reference: `PointLaw` with
+    analytic displacements at the points. Tolerance 1e-12 of the largest value: round-off.
     """
     scene = Scene(cell, degree)
     contact, law = scene.contact, scene.reference()
@@ -168,7 +168,7 @@ def test_history_is_exact(cell, degree):
         assert np.array_equal(status, expected["status"]), number
         assert wanted <= set(status.tolist()), number
         seen |= set(status.tolist())
-        # Nothing was committed yet.
+        # The slip is unchanged before the commit.
         assert close(gathered(COMM, contact.slip), law.beta, EXACT, scale=1.0), number
         contact.commit()
         law.commit(u, expected)
@@ -176,7 +176,7 @@ def test_history_is_exact(cell, degree):
         for name, value in (("traction", law.tau), ("jump", law.u)):
             committed = gathered(COMM, contact.history.values(name))
             assert close(committed, value, EXACT, scale=1.0), (number, name)
-        # The public results are the same numbers.
+        # The public results have the same values.
         assert close(gathered(COMM, contact.pressure), -expected["normal_traction"], EXACT, scale=1)
         gap = expected["opening"] - expected["penetration"]
         assert close(gathered(COMM, contact.gap), gap, EXACT, scale=0.1)
@@ -186,7 +186,7 @@ def test_history_is_exact(cell, degree):
 
 @pytest.mark.parametrize("cell", CELLS)
 def test_resultants_are_sums_over_the_points(cell):
-    """Force, area and counts against sums in numpy; the same on every rank. Round-off of sums."""
+    """Force, area and counts equal sums in numpy on every rank, to round-off (1e-12)."""
     scene = Scene(cell, 1)
     contact = scene.contact
     law = scene.reference()
@@ -212,8 +212,8 @@ def test_resultants_are_sums_over_the_points(cell):
 
 
 @pytest.mark.parametrize("cell", CELLS)
-def test_gather_is_all_of_the_surface_in_order(cell):
-    """`gather`: all points on every rank, ordered by coordinates, with the values of the points."""
+def test_gather_returns_all_points_in_order(cell):
+    """`gather` returns the values of all points on every rank, ordered by coordinates."""
     scene = Scene(cell, 1)
     contact = scene.contact
     for number in range(3):
@@ -239,8 +239,8 @@ def test_gather_is_all_of_the_surface_in_order(cell):
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_evaluation_leaves_the_history(cell):
-    """Whatever is evaluated between two commits, the history is the same to the last bit."""
+def test_evaluation_does_not_change_the_history(cell):
+    """Evaluations between two commits leave the history the same to the last bit."""
     scene = Scene(cell, 1)
     for number in range(3):
         scene.u.interpolate(scene.displacement(number))
@@ -256,11 +256,11 @@ def test_evaluation_leaves_the_history(cell):
 
 
 @pytest.mark.parametrize("cell", CELLS)
-def test_reopened_points_forget(cell):
-    """Reopened: no traction. Closed again: from no traction. Slip made while open does not count.
+def test_reopened_points_lose_their_traction(cell):
+    """Reopened points have no traction and close again without; motion while open is not slip.
 
-    Uniform motions, so that every number is made by hand: δ₋ = 0.05, limit 0.3*100*0.05 = 1.5.
-    Tolerance 1e-12: round-off.
+    The motions are uniform and the values computed by hand: δ₋ = 0.05, friction bound
+    0.3*100*0.05 = 1.5. Tolerance 1e-12: round-off.
     """
     d = dimension(cell)
     mesh, tags = block_mesh(cell, shuffled=True)
@@ -276,7 +276,7 @@ def test_reopened_points_forget(cell):
         contact.commit()
 
     def state() -> tuple[np.ndarray, np.ndarray]:
-        """Traction along x, and accumulated slip of all modes, of all points."""
+        """Return the traction along x and the accumulated slip of all modes at all points."""
         tau = gathered(COMM, contact.history.values("traction"))
         return tau[:, 0], gathered(COMM, contact.slip).sum(axis=1)
 
@@ -288,23 +288,23 @@ def test_reopened_points_forget(cell):
     expect(0.0, 0.0)
     move(0.01, 0.15)  # sticks: 60 * 0.01
     expect(-0.6, 0.0)
-    move(0.1, 0.15)  # trial 6, limit 1.5
+    move(0.1, 0.15)  # trial 6, bound 1.5
     expect(-1.5, 4.5 / 60)
     move(0.1, 0.05)  # opens
     expect(0.0, 4.5 / 60)
-    move(7.0, 0.05)  # travels while open
+    move(7.0, 0.05)  # moves while open
     expect(0.0, 4.5 / 60)
-    move(7.0, 0.15)  # closes straight down: no traction is left from before
+    move(7.0, 0.15)  # closes along the normal: no earlier traction remains
     expect(0.0, 4.5 / 60)
-    move(6.99, 0.15)  # sticks from there: 60 * 0.01 the other way
+    move(6.99, 0.15)  # sticks: 60 * 0.01 in the other direction
     expect(0.6, 4.5 / 60)
-    move(6.95, 0.15)  # trial 3, limit 1.5
+    move(6.95, 0.15)  # trial 3, bound 1.5
     expect(1.5, 4.5 / 60 + 1.5 / 60)
 
 
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
 def test_history_of_a_moving_obstacle(cell):
-    """It is the jump that counts: moving the obstacle by -a is moving the body by +a. Round-off."""
+    """Moving the obstacle by -a is equivalent to moving the body by a, to round-off (1e-12)."""
     d = dimension(cell)
     mesh, tags = block_mesh(cell, shuffled=True)
     surface = fc.ContactSurface(mesh, tags, BOTTOM)
@@ -334,10 +334,9 @@ def test_history_of_a_moving_obstacle(cell):
 def test_contact_spring(cell, method):
     """Code_Aster SSND116A: k_n = 1, k_t = 0.5, μ = 0.5, gap 0.5, unit springs, by `solve`.
 
-    The block's bottom is held by unit springs per area, loaded and in contact: all of it acts on
-    the same points, so that the block moves as a rigid body and its elasticity has no part. The
-    force N ramps to 1, then T goes to 2 and back to 0. Reference values of the benchmark; tolerance
-    1e-6 as stated for it, far above the solver's 1e-9.
+    Springs per area, load and contact all act on the bottom of the block, which therefore moves as
+    a rigid body without deformation. The force N increases to 1, then T to 2 and back to 0.
+    Reference: values of the benchmark, to its tolerance 1e-6, far above the solver's 1e-9.
     """
     scene = block(cell)
     d = scene.dim

@@ -1,6 +1,6 @@
-"""The table of a history: what is in a row, and that none is lost, doubled or half written.
+"""The table of a history has one complete row per increment, none lost or duplicated.
 
-References: the steps that `increments` yields, whose numbers are written with all digits.
+Reference: the steps that `increments` yields; numbers are written with all digits.
 """
 
 import csv
@@ -27,7 +27,7 @@ pytestmark = [pytest.mark.three_ranks, pytest.mark.timeout(120)]
 
 
 def table(path):
-    """Rows by column, as text."""
+    """Return the rows as dictionaries of text by column."""
     COMM.barrier()
     with open(path, newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -40,8 +40,8 @@ def numbers(rows, column):
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_a_row_is_a_step(cell, tmp_path):
-    """There and back in two calls with one file; every row is there when its step comes out."""
+def test_every_row_contains_the_results_of_its_step(cell, tmp_path):
+    """Each row equals its step, and is written before the step is yielded, in two calls."""
     path = shared_folder(tmp_path) / "history.csv"
     made = Press(cell=cell, wall=True)
     steps, moments = [], []
@@ -95,8 +95,8 @@ def test_a_row_is_a_step(cell, tmp_path):
     assert numbers(rows, "cuts") == [0.0] * len(steps)
 
 
-def test_a_resumed_history(tmp_path):
-    """Rows behind the checkpoint are replaced, those before it are as they were."""
+def test_restart_replaces_the_rows_after_the_checkpoint(tmp_path):
+    """A restart replaces the rows after the checkpoint and does not change those before it."""
     folder = shared_folder(tmp_path)
     whole, made, again = Press(), Press(), Press()
     list(whole.increments(3.0, csv=folder / "whole.csv"))
@@ -106,7 +106,7 @@ def test_a_resumed_history(tmp_path):
             break
     before = table(folder / "parts.csv")
     assert [row["increment"] for row in before] == ["1", "2", "3", "4", "5"]
-    if COMM.rank == 0:  # the run was killed in the middle of a row
+    if COMM.rank == 0:  # as if the run had been killed while it wrote a row
         with open(folder / "parts.csv", "a", encoding="utf-8") as file:
             file.write("6,3.0,12.")
     COMM.barrier()
@@ -121,24 +121,24 @@ def test_a_resumed_history(tmp_path):
         "floor: force x (force per thickness)",
     ):
         assert close(numbers(rows, column), numbers(expected, column), whole.tolerance)
-    # What is done is not done again, and leaves the table alone.
+    # A completed history computes nothing and does not change the table.
     done = Press()
     assert list(done.increments(3.0, **files)) == []
     assert table(folder / "parts.csv") == rows
-    # A history that starts anew has a table of its own.
+    # A new history, without a checkpoint, replaces the table.
     next(iter(Press().increments(3.0, csv=files["csv"])))
     assert [row["increment"] for row in table(folder / "parts.csv")] == ["1"]
 
 
 def test_cuts_errors_and_failures(tmp_path, monkeypatch):
-    """What `estimate` tells, and how often an increment was cut; rows outlive what ends the run."""
+    """Rows contain the errors of `estimate` and the number of cuts, and remain after a failure."""
     folder = shared_folder(tmp_path)
     made = Press()
     solve, calls = made.problem.solve, []
 
     def failing(**options):
         calls.append(options)
-        if len(calls) == 2:  # the second increment as a whole
+        if len(calls) == 2:  # the second increment, before it is cut
             made.problem.small_displacement_tolerance = 1e-12
         try:
             return solve(**options)
@@ -171,7 +171,7 @@ def test_cuts_errors_and_failures(tmp_path, monkeypatch):
 
 
 def test_wrong_input(tmp_path):
-    """Errors on all ranks before any work, and what is there stays."""
+    """Wrong input raises on all ranks before the first increment; existing files are unchanged."""
     folder = shared_folder(tmp_path)
     made = Rub()
     if COMM.rank == 0:
@@ -210,10 +210,11 @@ def test_wrong_input(tmp_path):
     raised_everywhere(again, ValueError, "damaged in line 3")
 
 
-def test_what_is_no_file_is_refused_and_stays(tmp_path):
-    """As a table /dev/zero was read without end, and as root a file took the place of /dev/null.
+def test_paths_that_are_not_regular_files_are_refused(tmp_path):
+    """A pipe is refused as table and checkpoint, and is not replaced.
 
-    A pipe stands for them: a checkpoint waited for whoever would write to it.
+    It represents all such paths: once /dev/zero was read endlessly as a table, a file replaced
+    /dev/null as root, and a checkpoint waited for data from a pipe.
     """
     folder = shared_folder(tmp_path)
     pipe = folder / "pipe"
@@ -233,8 +234,8 @@ def test_what_is_no_file_is_refused_and_stays(tmp_path):
     assert made.problem.increment == 0
 
 
-def test_a_row_that_cannot_be_written(tmp_path, monkeypatch):
-    """The error is everywhere, no half of a row is left, and the committed state stays."""
+def test_failed_write_leaves_table_and_state_unchanged(tmp_path, monkeypatch):
+    """A failed write raises on all ranks, leaves no partial row, and keeps the committed state."""
     path = shared_folder(tmp_path) / "h.csv"
     made = Rub()
     history = fc.increments(made.problem, made.load, steps=3, csv=path)
@@ -253,8 +254,8 @@ def test_a_row_that_cannot_be_written(tmp_path, monkeypatch):
     assert made.problem.increment == 2
 
 
-def test_finite_kinematics(tmp_path):
-    """Moments act where Γc has moved to; the number of the row's points is that of all ranks."""
+def test_moments_and_point_counts_with_finite_kinematics(tmp_path):
+    """Moments use the deformed positions of Γc, and the numbers of points include all ranks."""
     path = shared_folder(tmp_path) / "h.csv"
     made = Tool(law=fc.Frictionless(1e4))
     (step,) = made.increments(1.0, steps=1, csv=path)
@@ -263,7 +264,7 @@ def test_finite_kinematics(tmp_path):
     assert close([moment], made.contact.moment((0.0, 0.0)), 1e-12)
     points = sum(int(row[f"contact: {s} (points)"]) for s in ("open", "stick", "slip"))
     assert points == COMM.allreduce(len(made.contact.points))
-    # By the lever of the contact force: the origin is the middle of the block's bottom.
+    # Reference: sum of lever arm times force; the origin is the middle of the block's bottom.
     x = made.contact.points + made.contact.own_displacement()
     force = made.contact.measure[:, None] * made.contact.traction
     lever = COMM.allreduce(np.sum(x[:, 0] * force[:, 1] - x[:, 1] * force[:, 0]))
@@ -272,10 +273,10 @@ def test_finite_kinematics(tmp_path):
 
 
 def test_units_with_a_thickness(tmp_path):
-    """A weight makes forces and areas those of the whole body; without one they are per thickness.
+    """Forces and areas are per unit thickness without a weight, and of the body with one.
 
-    Reference: the same block, thickness 2.5: all integrals are so many times as large (1e-8 for
-    two solutions of the same equations), and the columns of the integrals alone are named anew.
+    Reference: with the thickness 2.5 as weight all integrals are 2.5 times as large (1e-8 for two
+    solutions of the same equations), and only the columns of integrals have another name.
     """
     folder, thickness = shared_folder(tmp_path), 2.5
     found = []

@@ -1,4 +1,4 @@
-"""Bodies of rubber with a pressure of their own: forms, closed forms, and locking."""
+"""Rubber with the pressure as an unknown: tangents, closed-form solutions, and locking."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ KINDS = ("plane strain", "axisymmetric", "3D")
 
 
 def body_of(w: fem.Function, nu: float, kind: str, isochoric: bool) -> tuple[NeoHookean, ufl.Form]:
-    """A body with a pressure, and its residual."""
+    """Return a body with the pressure as an unknown, and its residual."""
     (u, p), (v, q) = split(ufl.split(w)), split(ufl.TestFunctions(w.function_space))
     body = NeoHookean(u, E, nu, kind, isochoric=isochoric, pressure=p)
     dx = ufl.Measure("dx", w.function_space.mesh, metadata={"quadrature_degree": 4})
@@ -33,16 +33,17 @@ def body_of(w: fem.Function, nu: float, kind: str, isochoric: bool) -> tuple[Neo
 @pytest.mark.parametrize("isochoric", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("nu", [0.3, 0.5])
-def test_derivative(nu, kind, isochoric):
-    """Of the residual at a large strain, by central differences: 1e-7; and it is symmetric, 1e-12.
+def test_tangent_is_the_symmetric_derivative_of_the_residual(nu, kind, isochoric):
+    """The tangent at large strain is the derivative of the residual, to 1e-7, and symmetric.
 
-    So there is a potential of displacement and pressure.
+    Reference: central differences. Symmetry, to 1e-12, implies a potential of displacement and
+    pressure.
     """
     cell = "tetrahedron" if kind == "3D" else "triangle"
     mesh, _ = block_mesh(cell, n=2)
     mesh.geometry.x[:, 0] += 0.5
     w, direction, other = (fem.Function(mixed_space(mesh, "Taylor-Hood")) for _ in range(3))
-    amplitude = 0.01 if kind == "3D" else 0.05  # of waves, in three directions a steep one
+    amplitude = 0.01 if kind == "3D" else 0.05  # of the waves, which are steep in three dimensions
     for function, seed, size in ((w, 0, amplitude), (direction, 1, 1.0), (other, 2, 1.0)):
         function.sub(0).interpolate(lambda x, s=seed, a=size: a * wave(dimension(cell), s)(x))
         function.sub(1).interpolate(lambda x, s=seed, a=size: 300 * a * np.cos(3 * x[0] + s))
@@ -67,9 +68,10 @@ def test_derivative(nu, kind, isochoric):
 
 
 def stresses(along: float, nu: float, kind: str, isochoric: bool) -> tuple[float, float, float]:
-    """Of a free column at a stretch along: stretch across, nominal stress along, pressure.
+    """Return transverse stretch, axial nominal stress and pressure of a column by axial stretch.
 
-    Where ν is 1/2 in closed form, or else by bisection with the derivatives of W by hand.
+    They are closed forms if ν is 1/2, and otherwise found by bisection with hand-derived
+    derivatives of W.
     """
     shear = E / (2 * (1 + nu))
     if nu == 0.5:
@@ -104,12 +106,12 @@ def stresses(along: float, nu: float, kind: str, isochoric: bool) -> tuple[float
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("nu", [0.4, 0.4999, 0.5])
 def test_column_at_large_strain(nu, kind, isochoric):
-    """Pressed to two thirds of its height between smooth planes: uniform stretches and pressure.
+    """A column compressed to two thirds of its height between frictionless planes is uniform.
 
-    Force, pressure and true stress are those of `stresses`, 1e-6; the floor gives way by p/k_n.
+    Reference: force, pressure and stresses by `stresses`, to 1e-6; the penetration is p/k_n.
     """
     k_n, nominal = 1e6, 0.0
-    for _ in range(30):  # until the floor is as deep as it is pressed
+    for _ in range(30):  # until penetration and pressure are consistent
         across, nominal, pressure = stresses((2.0 - nominal / k_n) / 3.0, nu, kind, isochoric)
     d = 3 if kind == "3D" else 2
     cell = "tetrahedron" if d == 3 else "triangle"
@@ -157,7 +159,7 @@ def test_column_at_large_strain(nu, kind, isochoric):
 
 
 def force_under_a_disc(n: int, nu: float, **options) -> float:
-    """On a block 2 x 1, its bottom held, pressed by a tenth with a disc of radius 0.8."""
+    """Return the force of a disc of radius 0.8, pressed by 0.1 into a block of 2 x 1."""
     scene = rubber("triangle", n=(2 * n, n), nu=nu, E=E, **options)
     shift = fem.Constant(scene.mesh, np.zeros(2))
     law = fc.Coulomb(0.3, 1e4, 1e4)
@@ -170,10 +172,10 @@ def force_under_a_disc(n: int, nu: float, **options) -> float:
 
 @pytest.mark.parametrize("isochoric", [False, True])
 @pytest.mark.parametrize("nu", [0.3, 0.45])
-def test_both_forms_converge_to_the_same(nu, isochoric):
-    """With and without pressure forces differ by 2.5e-3 on coarse meshes, a fifth of it on finer.
+def test_forms_with_and_without_pressure_converge_to_the_same_force(nu, isochoric):
+    """Forces with and without pressure differ by 2.5e-3, on a finer mesh by a fifth of that.
 
-    Of quadratic displacements; the pressure of degree 1 is what they differ by.
+    Displacements are quadratic in both; the pressure of degree 1 causes the difference.
     """
     errors = []
     for n in (8, 16):
@@ -183,12 +185,12 @@ def test_both_forms_converge_to_the_same(nu, isochoric):
     assert errors[0] < 2.5e-3 and errors[1] < errors[0] / 5
 
 
-def test_locking():
-    """At ν = 0.4999 linear displacements alone bear three times the force, with pressure they do.
+def test_volumetric_locking_with_and_without_pressure():
+    """At ν = 0.4999 linear elements lock, with three times the force; MINI elements do not.
 
-    Errors of the force under a disc on 8 cells of height, by that of Taylor and Hood's elements on
-    32, where those have converged to 1e-4: linear ones 240 %, MINI 3 %, quadratic ones 0.4 %,
-    Taylor-Hood 0.04 %.
+    Errors of the force under a disc with 8 cells over the height: linear elements 240 %, MINI 3 %,
+    quadratic ones 0.4 %, Taylor-Hood 0.04 %. Reference: Taylor-Hood elements with 32 cells, which
+    have converged to 1e-4.
     """
     reference = force_under_a_disc(32, 0.4999, mixed="Taylor-Hood")
     found = {
@@ -202,8 +204,8 @@ def test_locking():
     assert abs(errors["Taylor-Hood"]) < 1e-3
 
 
-def test_what_has_no_sense_is_refused():
-    """A pressure without its test function, a vector for it, ν beyond 1/2: each is named."""
+def test_invalid_pressure_and_poisson_ratio_are_refused():
+    """A missing test function, a vector pressure and ν outside of its range are refused by name."""
     mesh, _ = block_mesh("triangle")
     w = fem.Function(mixed_space(mesh, "Taylor-Hood"))
     (u, p), (v, q) = ufl.split(w), ufl.TestFunctions(w.function_space)

@@ -1,4 +1,4 @@
-"""What the installation tells of itself, beside what is known by another way."""
+"""Information on the installation, against independent sources."""
 
 import itertools
 import logging
@@ -25,12 +25,12 @@ pytestmark = [pytest.mark.two_ranks, pytest.mark.newest]
 
 
 def area():
-    """A form that compiles fast."""
+    """Return a form that compiles fast."""
     return fem.Constant(dolfinx.mesh.create_unit_square(COMM, 1, 1), 1.0) * ufl.dx
 
 
-def test_what_is_there():
-    """Versions of what is imported; numbers of this run."""
+def test_versions_and_paths_of_the_installation():
+    """Versions and types are those of the imported packages, and reported paths exist."""
     compiling.compile_form(area())
     found = information()
     assert found["fenics_contact"] == fc.__version__
@@ -47,15 +47,15 @@ def test_what_is_there():
         assert Path(path).exists()
 
 
-def test_orderings_are_tried():
-    """AMD and QAMD are parts of MUMPS itself; one that does not exist is not taken for one."""
+def test_available_orderings_of_mumps():
+    """AMD, AMF and QAMD, parts of MUMPS, are found; no unknown ordering is reported."""
     found = information()["direct solver"]
     words = found.split(";")[0].removeprefix("MUMPS, orderings ").split(", ")
     assert {"AMD", "AMF", "QAMD"} <= set(words) <= {"AMD", "AMF", "QAMD", "PORD", "SCOTCH", "METIS"}
 
 
-def test_the_program(capsys):
-    """One line each, on the first rank alone; another word is refused."""
+def test_info_command_prints_on_the_first_rank(capsys):
+    """The command prints one line per entry on the first rank; an unknown command is refused."""
     assert program.main(["info"]) == 0
     printed = capsys.readouterr().out
     lines = COMM.bcast(printed).splitlines()
@@ -71,13 +71,13 @@ def exits(words):
         raise RuntimeError(f"exit {error.code}") from None
 
 
-def test_what_a_first_run_waits_for_is_said_once(monkeypatch, caplog, capsys):
-    """In the log, or to a terminal; nothing where neither looks, nor of forms from the cache."""
+def test_compilation_is_reported_once(monkeypatch, caplog, capsys):
+    """The log or else the terminal reports slow compilation, but not forms from the cache."""
     form = area()
     first = COMM.rank == 0
 
     def said(level, *, terminal, seconds):
-        """How often two forms that take so long are told of, in the log and on the terminal."""
+        """Return how often the compilation of two forms is reported in log and terminal."""
         caplog.clear()
         times = itertools.count(0.0, seconds)
         monkeypatch.setattr(compiling.time, "perf_counter", lambda: next(times))

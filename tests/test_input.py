@@ -1,4 +1,4 @@
-"""Loads, conditions and values that have no solution: an error that names them, on every rank."""
+"""Loads, conditions and values without a solution raise an error that names them, on every rank."""
 
 import numpy as np
 import pytest
@@ -21,18 +21,18 @@ pytestmark = [
 COMM = MPI.COMM_WORLD
 
 
-def test_the_good_scene_is_solved():
-    """What the tests below spoil in one respect is sound otherwise: it carries its load, 1."""
+def test_valid_scene_is_solved():
+    """The scene in which the tests below change one input is valid: it carries its load, 1."""
     step = build_and_solve(pressed())()
     # Equilibrium to the solver's tolerance, 1e-9 of the forces.
     assert step.contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
 
 
-def test_a_load_that_is_zero_in_ufl():
-    """Its integral is empty, and the only one over its kind of facets: no load, no error.
+def test_load_that_is_zero_in_ufl_is_no_error():
+    """The integral of the load is empty, and the only one over its kind of facets.
 
-    The top moves down by 1e-3 of a height of 1, held aside at x = 0 and free at the other side:
-    plane strain and a penalty of 1e4 in series, 1/(1/k_n + (1 - ν²)/E), to the solver's 1e-9.
+    The top moves down by 1e-3 of a height of 1, with rollers at x = 0 and the other side free:
+    plane strain and a penalty of 1e4 in series, 1/(1/k_n + (1 - ν²)/E), to 1e-8.
     """
     scene = block("quadrilateral", 1, **MESH)
     v = ufl.TestFunction(scene.u.function_space)
@@ -45,8 +45,8 @@ def test_a_load_that_is_zero_in_ufl():
     assert step.contacts["contact"].normal_force == pytest.approx(exact, rel=1e-8)
 
 
-def test_form_without_stiffness():
-    """A modulus of zero is found before it becomes a singular matrix."""
+def test_form_without_stiffness_is_refused():
+    """A modulus of zero is detected before it leads to a singular matrix."""
     scene = pressed(E=0.0)
     raised_everywhere(build_and_solve(scene), ValueError, "stiffness")
 
@@ -57,8 +57,8 @@ def test_form_without_stiffness():
 @pytest.mark.each
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("name", ["traction", "body_force", "E", "nu"])
-def test_constants_not_finite(name, value):
-    """A load or modulus constant that is not finite: refused at once, and by a later solve."""
+def test_constants_that_are_not_finite_are_refused(name, value):
+    """A load or modulus that is not finite is refused by the first and by later solves."""
     scene = pressed()
     constant = getattr(scene, name)
     good = constant.value.copy()
@@ -72,13 +72,13 @@ def test_constants_not_finite(name, value):
     constant.value = np.full_like(constant.value, value)
     raised_everywhere(problem.solve, ValueError, "finite", "constant")
     assert all(COMM.allgather(bool(np.array_equal(scene.u.x.array, before))))
-    # Once it is mended the problem goes on.
+    # With a finite constant the problem is solved again.
     constant.value = good
     problem.solve()
 
 
-def test_a_stiffness_without_bound():
-    """ν = 0.5, set between increments, makes λ infinite: the message says where to look."""
+def test_infinite_stiffness_is_refused():
+    """ν = 0.5, set between increments, makes λ infinite: the error names ν = 0.5 as a cause."""
     scene = pressed()
     problem, _ = scene.problem(coulomb(), scene.rollers())
     problem.solve()
@@ -88,10 +88,10 @@ def test_a_stiffness_without_bound():
 
 
 @pytest.mark.parametrize("way", [1e8, 1e9])
-def test_a_mesh_far_from_the_origin(way):
-    """Where coordinates are round-off the mesh is refused; nearer the load is borne.
+def test_mesh_too_far_from_the_origin_is_refused(way):
+    """If coordinates are round-off the mesh is refused; nearer to the origin the load is carried.
 
-    Coordinates have 1e-8 of the mesh there; forces are in balance to 1e-8 of the load.
+    At 1e8 coordinates have a round-off of 1e-8 of the mesh; forces balance to 1e-8 of the load.
     """
     mesh, tags = block_mesh("quadrilateral", **MESH)
     mesh.geometry.x[:, :2] += way
@@ -112,8 +112,8 @@ def test_a_mesh_far_from_the_origin(way):
 
 
 @pytest.mark.parametrize("what", ["load", "modulus"])
-def test_function_not_finite_on_one_rank(what):
-    """One NaN in a coefficient function, in one cell of one rank: named, on all ranks."""
+def test_function_that_is_nan_on_one_rank_is_refused(what):
+    """A coefficient function with NaN in cells of one rank is named on all ranks."""
     scene = pressed()
     field = fem.Function(fem.functionspace(scene.mesh, ("DG", 0)), name=f"the {what}")
     field.x.array[:] = 1.0
@@ -131,8 +131,8 @@ def test_function_not_finite_on_one_rank(what):
 @pytest.mark.whole
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("kind", ["constant", "function"])
-def test_dirichlet_value_not_finite(kind, value):
-    """A prescribed displacement that is not finite; by a function at one dof, so on one rank."""
+def test_dirichlet_value_that_is_not_finite_is_refused(kind, value):
+    """The value is a constant, or a function with one such dof, and thus on one rank only."""
     scene = pressed()
     if kind == "constant":
         bc = scene.hold(TOP, 1, value)
@@ -147,8 +147,8 @@ def test_dirichlet_value_not_finite(kind, value):
     )
 
 
-def test_start_not_finite_on_one_rank():
-    """A u that starts with one NaN."""
+def test_initial_displacement_that_is_nan_on_one_rank_is_refused():
+    """An initial u with one NaN is refused on all ranks."""
     scene = pressed()
     x = scene.u.function_space.tabulate_dof_coordinates()
     corner = np.flatnonzero(np.isclose(x[:, 0], 1.0) & np.isclose(x[:, 1], 1.0))
@@ -157,8 +157,8 @@ def test_start_not_finite_on_one_rank():
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_displacement_of_the_obstacle_not_finite(kinematics):
-    """An obstacle moved to NaN between two increments."""
+def test_obstacle_displacement_that_is_nan_is_refused(kinematics):
+    """An obstacle whose displacement becomes NaN between two increments is refused."""
     scene = pressed()
     motion = fem.Constant(scene.mesh, np.zeros(2))
     options = {"displacement": motion, "kinematics": kinematics}
@@ -169,8 +169,8 @@ def test_displacement_of_the_obstacle_not_finite(kinematics):
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_tangential_displacement_of_the_obstacle_not_finite(kinematics):
-    """An obstacle moved to NaN along itself only: the gap does not show it in every arrangement."""
+def test_tangential_obstacle_displacement_that_is_nan_is_refused(kinematics):
+    """A tangential displacement of NaN is refused, although it need not enter the gap."""
     scene = pressed()
     motion = fem.Constant(scene.mesh, np.zeros(2))
     options = {"displacement": motion, "kinematics": kinematics}
@@ -183,8 +183,8 @@ def test_tangential_displacement_of_the_obstacle_not_finite(kinematics):
 # ---- Dirichlet conditions on Γc ------------------------------------------------------------------
 
 
-def test_contact_surface_clamped():
-    """Γc with all displacements prescribed, by one condition or by components: refused."""
+def test_clamped_contact_surface_is_refused():
+    """Γc with all displacements prescribed, by one condition or by components, is refused."""
     scene = pressed()
     dofs = scene.facet_dofs(BOTTOM)
     clamp = fem.dirichletbc(np.zeros(2), dofs, scene.u.function_space)
@@ -194,8 +194,8 @@ def test_contact_surface_clamped():
         )
 
 
-def test_contact_surface_overlapping_in_part():
-    """One facet of Γc clamped, on one rank: found by all."""
+def test_contact_surface_with_one_clamped_facet_is_refused():
+    """One facet of Γc is clamped, on one rank: the error is raised on all ranks."""
     scene = pressed()
     surface = fc.ContactSurface(scene.mesh, scene.tags, [BOTTOM, RIGHT])
     contact = fc.Contact(scene.u, surface, scene.floor(), coulomb())
@@ -210,8 +210,8 @@ def test_contact_surface_overlapping_in_part():
     )
 
 
-def test_contact_surface_held_in_one_component():
-    """Γc held along itself only is ordinary, and so is one that shares an edge with a clamp."""
+def test_partly_constrained_contact_surface_is_solved():
+    """Γc may have a prescribed tangential displacement, or share an edge with a clamped side."""
     scene = pressed()
     problem, _ = scene.problem(coulomb(), [scene.hold(BOTTOM, 0)])
     step = problem.solve()
@@ -222,17 +222,17 @@ def test_contact_surface_held_in_one_component():
     problem.solve()
 
 
-# ---- loads and motions that nothing can hold -----------------------------------------------------
+# ---- unbalanced loads and unconstrained rigid-body modes -----------------------------------------
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_load_that_pulls_the_body_off(cell):
-    """A load away from the obstacle, nothing else holding: no contact force can balance it."""
+def test_load_away_from_the_obstacle_is_refused(cell):
+    """No contact force can balance a load away from the obstacle without a Dirichlet condition."""
     scene = block(cell, up=1.0)
     raised_everywhere(build_and_solve(scene), ValueError, "balance", "translation along")
     scene = block(cell, up=1.0)
     raised_everywhere(build_and_solve(scene, bcs=[]), ValueError, "balance")
-    # Held at the top it is a matter of elasticity.
+    # With the normal displacement of the top prescribed elasticity balances the load.
     scene = block(cell, up=1.0)
     held = [*scene.rollers(), scene.hold(TOP, scene.dim - 1)]
     step = build_and_solve(scene, bcs=held)()
@@ -240,8 +240,8 @@ def test_load_that_pulls_the_body_off(cell):
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_no_friction_against_a_free_motion(cell):
-    """A body that can slide: the motions that nothing will ever hold are named."""
+def test_sliding_modes_without_friction_are_refused(cell):
+    """The error names the rigid-body modes that no contact force can ever balance."""
     scene = block(cell, up=-1.0, side=0.1)
     words = ["translation along x"] + (["translation along y"] if scene.dim == 3 else [])
     frictionless = fc.Frictionless(k_n=1e4)
@@ -252,10 +252,10 @@ def test_no_friction_against_a_free_motion(cell):
     problem.solve()
 
 
-def test_a_motion_along_a_cavity():
-    """A body inside a round cavity without friction can turn about the axis: named."""
+def test_rotation_in_a_frictionless_cavity_is_refused():
+    """A body inside a round cavity without friction can rotate about its axis, which is named."""
     scene = pressed()
-    # The cavity's axis is the middle of the block: turning about it is felt by no point.
+    # The cavity's axis is the middle of the block: a rotation about it changes no gap.
     cavity = fc.Ball((0.5, 0.5), 2.0, inside=True)
     raised_everywhere(
         lambda: scene.problem(fc.Frictionless(k_n=1e4), [], contact={"obstacle": cavity}),
@@ -264,8 +264,8 @@ def test_a_motion_along_a_cavity():
     )
 
 
-def test_a_body_without_contact_or_conditions():
-    """Nothing holds it at all: every motion is named."""
+def test_body_without_contact_or_conditions_is_refused():
+    """A body without contact or Dirichlet conditions is unconstrained: all its modes are named."""
     scene = pressed()
     raised_everywhere(
         lambda: fc.ContactProblem(scene.F, scene.u),
@@ -277,15 +277,15 @@ def test_a_body_without_contact_or_conditions():
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_load_that_slides_the_body(cell):
-    """A tangential load beyond μ times the normal one, nothing else holding; below it is held.
+def test_load_above_the_friction_limit_is_refused(cell):
+    """A tangential load above μ times the normal one is refused without other constraints.
 
-    By a sixth beyond: in space the check encloses the cone by a polygon that is 8 % too wide.
+    It is larger by a sixth: in space the check encloses the cone by a polygon that is 8 % too wide.
     """
     scene = block(cell, up=-1.0, side=0.35)
     problem, _ = scene.problem(coulomb(0.3), [])
     raised_everywhere(problem.solve, ValueError, "balance", "translation along x")
-    # By more friction, not by less load: the load at the top turns the block over (0.35 < 0.5).
+    # More friction balances the load; its moment does not tip the block (0.35 < 0.5).
     held, _ = scene.problem(coulomb(0.5), [])
     step = held.solve()
     resultants = step.contacts["contact"]
@@ -294,18 +294,18 @@ def test_load_that_slides_the_body(cell):
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_load_that_tips_the_body(cell):
-    """A load whose line of action leaves the base, with friction enough: the rotation is named.
+def test_load_that_tips_the_body_is_refused(cell):
+    """A load whose line of action leaves the base, with sufficient friction, names the rotation.
 
-    On a unit block the side force H at the top tips it over the edge from H = V/2 on.
+    A side force H at the top of a unit block tips it over the edge from H = V/2 on.
     """
     scene = block(cell, up=-1.0, side=0.6)
     problem, _ = scene.problem(coulomb(2.0), [])
     raised_everywhere(problem.solve, ValueError, "balance", "rotation")
 
 
-def test_balanced_after_a_bad_load():
-    """A refused load leaves no trace: the next, sound one is solved."""
+def test_next_increment_is_solved_after_a_refused_load():
+    """A refused load leaves the state unchanged: the next, valid one is solved."""
     scene = block("quadrilateral", up=1.0)
     problem, _ = scene.problem(coulomb(), scene.rollers())
     raised_everywhere(problem.solve, ValueError, "balance")
@@ -316,8 +316,8 @@ def test_balanced_after_a_bad_load():
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_load_beyond_friction(cell):
-    """Pushed along by 1 to 8 % more than μN: both are named. What friction can bear is solved."""
+def test_load_and_friction_limit_are_stated(cell):
+    """The error states a load of 1 to 8 % above μN, and the limit. A load below μN is solved."""
     friction, pressure = 0.3, 2.0
     words = ["balance", "translation along x", "at most 0.6"]
     for over in (1.01, 1.08):
@@ -328,11 +328,11 @@ def test_load_beyond_friction(cell):
     assert build_and_solve(scene, coulomb(friction), [])().verdict.failures == []
 
 
-# ---- errors and sums of all ranks ----------------------------------------------------------------
+# ---- collective errors and sums ------------------------------------------------------------------
 
 
-def test_collective_errors_on_one_rank():
-    """An error of one rank reaches all of them, kind and text; without one nothing happens."""
+def test_error_of_one_rank_is_raised_on_all():
+    """Type and text of an error on one rank reach all ranks; without an error nothing happens."""
     last = COMM.size - 1
 
     def fail(kind):
@@ -348,7 +348,7 @@ def test_collective_errors_on_one_rank():
 
 
 def test_reductions_over_ranks():
-    """NaN on one rank wins, a rank without entries does not count, none at all gives ``empty``."""
+    """NaN on one rank dominates, empty ranks do not count; without entries it is ``empty``."""
     one = np.array([1.0 + COMM.rank])
     assert parallel.global_max(COMM, one) == COMM.size
     assert parallel.global_min(COMM, one) == 1.0
@@ -365,8 +365,8 @@ def test_reductions_over_ranks():
 
 
 @pytest.mark.parametrize("field", [True, False])
-def test_nodes_that_are_moved(field):
-    """Points, gaps and the stiffness are of where nodes were: moved ones are refused, not mixed."""
+def test_mesh_moved_between_increments_is_refused(field):
+    """Points, gaps and stiffness belong to the original nodes: moved nodes are refused."""
     scene = pressed()
     problem, contact = scene.problem(coulomb(), scene.rollers())
     problem.solve(recover_interior=field)
@@ -376,4 +376,4 @@ def test_nodes_that_are_moved(field):
     raised_everywhere(lambda: problem.solve(recover_interior=field), ValueError, "moved", "0.3")
     assert np.array_equal(contact.history.rows(), before) and problem.increment == 1
     scene.mesh.geometry.x[:, 0] /= 1.3
-    fc.ContactSurface(scene.mesh, scene.tags, BOTTOM)  # of the mesh as it is now
+    fc.ContactSurface(scene.mesh, scene.tags, BOTTOM)  # the scaled mesh is reset

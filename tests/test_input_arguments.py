@@ -1,4 +1,4 @@
-"""What is no argument at all: swapped, missing, of another mesh or kind; named, on every rank."""
+"""Errors on all ranks name arguments that are swapped, missing, mistyped or of another mesh."""
 
 import subprocess
 import sys
@@ -45,22 +45,22 @@ def contact_with(u, scene: Block) -> Callable:
     ],
     ids=["scalar", "three components", "tensor", "RT", "N1curl", "DG0", "DG1"],
 )
-def test_displacement_of_a_wrong_space(element, words):
-    """A u that is no continuous vector-valued Lagrange function of the mesh's dimension."""
+def test_displacement_must_be_vector_valued_lagrange(element, words):
+    """A u is refused unless it is continuous, Lagrange and a vector of the mesh's dimension."""
     scene = block("triangle", **MESH)
     u = fem.Function(fem.functionspace(scene.mesh, element))
     raised_everywhere(contact_with(u, scene), ValueError, "u ", *words)
 
 
-def test_displacement_of_crouzeix_raviart():
-    """Continuity at the middle of facets alone is not enough for a displacement on Γc."""
+def test_crouzeix_raviart_displacement_is_refused():
+    """Continuity at facet midpoints alone is not enough for a displacement on Γc."""
     scene = block("triangle", **MESH)
     u = fem.Function(fem.functionspace(scene.mesh, ("CR", 1, (2,))))
     raised_everywhere(contact_with(u, scene), ValueError, "u ", "Lagrange")
 
 
-def test_displacement_in_single_precision():
-    """Compiled forms and PETSc are in double precision."""
+def test_single_precision_displacement_is_refused():
+    """A u in single precision is refused: compiled forms and PETSc use double precision."""
     mesh = dolfinx.mesh.create_unit_square(COMM, 4, 4, dtype=np.float32)
     mesh.topology.create_connectivity(1, 2)
     facets = dolfinx.mesh.exterior_facet_indices(mesh.topology)
@@ -74,21 +74,21 @@ def test_displacement_in_single_precision():
     raised_everywhere(call, ValueError, "float32", "float64")
 
 
-def test_displacement_on_another_mesh():
-    """A u of a mesh that is not that of the surface."""
+def test_displacement_on_another_mesh_is_refused():
+    """A u on a mesh other than that of the surface is refused."""
     scene, other = pressed(), pressed()
     raised_everywhere(contact_with(other.u, scene), ValueError, "mesh")
 
 
-def test_displacement_that_is_no_function():
-    """A trial function, an expression or an array is no u."""
+def test_displacement_must_be_a_function():
+    """A trial function, an expression or an array is refused as u."""
     scene = pressed()
     for u in (ufl.TrialFunction(scene.u.function_space), 2 * scene.u, scene.u.x.array):
         raised_everywhere(contact_with(u, scene), ValueError, "u is a")
 
 
-def test_displacement_of_another_problem():
-    """The contact's u and the problem's are the same function, not two of one space."""
+def test_displacement_of_contact_must_be_that_of_the_problem():
+    """The u of a contact must be that of the problem, not another function of the same space."""
     scene = pressed()
     other = fem.Function(scene.u.function_space)
     contact = fc.Contact(other, scene.surface, scene.floor(), coulomb())
@@ -99,8 +99,11 @@ def test_displacement_of_another_problem():
     )
 
 
-def test_displacement_in_a_mixed_element():
-    """The whole of it, parts that no derivative knows, no vector: told what to give instead."""
+def test_wrong_uses_of_mixed_elements_are_refused():
+    """A mixed function, its ``sub(i)``, expressions and scalars are refused with the correct call.
+
+    So are forms, options and Dirichlet conditions that do not fit a mixed function.
+    """
     scene = pressed()
     line = basix.ufl.element("P", "quadrilateral", 1)
     vector = basix.ufl.element("P", "quadrilateral", 2, shape=(2,))
@@ -145,8 +148,8 @@ def test_displacement_in_a_mixed_element():
     raised_everywhere(problem(F, both, bcs=[stray]), ValueError, "Dirichlet", "W.sub(0)")
 
 
-def test_fields_as_a_list_of_functions():
-    """Blocked spaces are refused with the way there is; and a function with two displacements."""
+def test_fields_as_a_list_of_functions_are_refused():
+    """Blocked spaces are refused with the alternative, as are functions of two displacements."""
     scene = pressed()
     p = fem.Function(fem.functionspace(scene.mesh, ("Lagrange", 1)))
     F = scene.F
@@ -174,11 +177,11 @@ def test_fields_as_a_list_of_functions():
     )
 
 
-# ---- what is no argument at all ------------------------------------------------------------------
+# ---- arguments of wrong types --------------------------------------------------------------------
 
 
-def test_arguments_of_a_contact():
-    """Swapped, missing, a class for an object: named, with the order there is."""
+def test_wrong_arguments_of_a_contact_are_named():
+    """Swapped or missing arguments and classes instead of objects are named, with the order."""
     scene = pressed()
     u, surface, floor, law = scene.u, scene.surface, scene.floor(), coulomb()
     for arguments, words in (
@@ -198,8 +201,8 @@ def test_arguments_of_a_contact():
     raised_everywhere(lambda: scene.contact(law, tolerance="1e-3"), ValueError, "tolerance is '1e-")
 
 
-def test_arguments_of_a_problem():
-    """One contact or condition for a list of them, other things in the list, no mapping."""
+def test_wrong_arguments_of_a_problem_are_named():
+    """Single objects instead of lists, wrong types in lists and non-mappings are named."""
     scene = pressed()
     contact, bcs = scene.contact(coulomb()), scene.rollers()
     for arguments, words in (
@@ -219,8 +222,8 @@ def test_arguments_of_a_problem():
     raised_everywhere(lambda: fc.ContactProblem(scene.u, scene.F), ValueError, "u is a Form")
 
 
-def test_arguments_of_a_surface():
-    """Mesh and tags swapped, facets for tags, a tag that is no whole number."""
+def test_wrong_arguments_of_a_surface_are_named():
+    """Swapped mesh and tags, facets instead of tags, and tags that are not integers are named."""
     scene = pressed()
     mesh, tags = scene.mesh, scene.tags
     for arguments, word in (
@@ -244,8 +247,8 @@ def test_arguments_of_a_surface():
 
 @pytest.mark.whole
 @pytest.mark.parametrize("degree", [1, 2.5, 2.0, "2", True, 0, -1])
-def test_quadrature_degree(degree):
-    """A degree is an integer, at least 2: one point does not resist a tilt of its facet."""
+def test_quadrature_degree_must_be_an_integer_of_at_least_two(degree):
+    """The degree is an integer of at least 2: one point does not resist a tilt of its facet."""
     scene = pressed()
     raised_everywhere(
         lambda: fc.ContactSurface(scene.mesh, scene.tags, BOTTOM, quadrature_degree=degree),
@@ -255,8 +258,8 @@ def test_quadrature_degree(degree):
     )
 
 
-def test_numbers_of_obstacles():
-    """Texts for numbers in points, radii and forces; no list where one is wanted."""
+def test_parameters_of_obstacles_must_be_numbers():
+    """Strings as points, radii, forces or moduli are named, and a scalar instead of a list."""
     scene = pressed()
     for obstacle, word in (
         (fc.HalfSpace("origin", (0, 1)), "point of the HalfSpace is 'origin'"),
@@ -276,10 +279,11 @@ def test_numbers_of_obstacles():
 
 
 @pytest.mark.parametrize("held", [True, False])
-def test_an_obstacle_turned_round(held, caplog):
-    """The normal of a floor points down, a ball is outside of what it should surround.
+def test_reversed_obstacle_is_refused_or_warned_of(held, caplog):
+    """The normal of a floor points down, or a ball is solid that should surround the body.
 
-    The body is inside: refused. A floor that just touches is one that the body leaves: warned.
+    If the body is inside the obstacle, it is refused. If a reversed floor just touches the
+    body, there is a warning.
     """
     scene = pressed()
     bcs = [*scene.rollers(), scene.hold(TOP, 1)] if held else scene.rollers()
@@ -300,8 +304,8 @@ def test_an_obstacle_turned_round(held, caplog):
 
 @pytest.mark.skipif(COMM.size > 1, reason="starts a process of its own")
 @pytest.mark.parametrize("version", ["0.8.0", "0.5.2.dev0"])
-def test_a_release_that_is_too_old(version):
-    """One sentence at import, with what to do."""
+def test_old_dolfinx_is_refused_at_import(version):
+    """The import raises one sentence that states the required version of DOLFINx."""
     script = f"import dolfinx; dolfinx.__version__ = {version!r}; import fenics_contact"
     command = [sys.executable, "-c", script]
     done = subprocess.run(command, env=environment(), capture_output=True, text=True)
@@ -318,8 +322,8 @@ def with_form(scene: Block, F) -> Callable:
     )
 
 
-def test_forms_with_wrong_arguments():
-    """F is a residual in u and one test function of u's space; everything else is named."""
+def test_form_must_be_a_residual_with_one_test_function():
+    """F must be a residual in u and one test function of u's space; other forms are named."""
     scene = pressed()
     space = scene.u.function_space
     v, du = ufl.TestFunction(space), ufl.TrialFunction(space)
@@ -337,8 +341,8 @@ def test_forms_with_wrong_arguments():
     raised_everywhere(with_form(scene, mixed), ValueError, "TestFunction")
 
 
-def test_form_in_another_function():
-    """F written with a function of the same space that is not u."""
+def test_form_in_another_function_is_refused():
+    """F in a function of the same space other than u is refused."""
     scene = pressed()
     other = fem.Function(scene.u.function_space)
     raised_everywhere(
@@ -346,7 +350,7 @@ def test_form_in_another_function():
     )
 
 
-def test_condition_on_another_space():
+def test_condition_on_another_space_is_refused():
     """A Dirichlet condition of another, larger space is refused."""
     scene = pressed()
     other = displacement_space(scene.mesh, 3)
@@ -356,8 +360,8 @@ def test_condition_on_another_space():
     raised_everywhere(lambda: scene.problem(coulomb(), [bc]), ValueError, "Dirichlet", "space")
 
 
-def test_condition_on_a_scalar_space():
-    """One of as many nodes is another all the same: its numbers of dofs are other places of u."""
+def test_condition_on_a_scalar_space_is_refused():
+    """A scalar space of the same nodes is refused: its dof numbers refer to other dofs of u."""
     scene = pressed()
     space = fem.functionspace(scene.mesh, ("Lagrange", 1))
     component, _ = scene.u.function_space.sub(0).collapse()
@@ -372,8 +376,8 @@ def test_condition_on_a_scalar_space():
 # ---- the problem ---------------------------------------------------------------------------------
 
 
-def test_two_contacts_of_one_name():
-    """Results are by name, so names are unique."""
+def test_contact_names_must_be_unique():
+    """Results are stored by name, so that two contacts of the same name are refused."""
     scene = pressed()
     contacts = [scene.contact(coulomb(), name="foot") for _ in range(2)]
     raised_everywhere(
@@ -384,8 +388,8 @@ def test_two_contacts_of_one_name():
     )
 
 
-def test_unknown_method():
-    """The message lists the methods there are."""
+def test_unknown_method_is_refused():
+    """The error lists the available methods."""
     scene = pressed()
     raised_everywhere(
         lambda: scene.problem(coulomb(), scene.rollers(), method="bfgs"),
@@ -399,8 +403,8 @@ def test_unknown_method():
 @pytest.mark.whole
 @pytest.mark.parametrize("value", [-0.1, 1.1, np.nan, "1"])
 @pytest.mark.parametrize("name", ["alpha", "phi"])
-def test_shares_out_of_range(name, value):
-    """α and φ are shares, 0 to 1 (section 5)."""
+def test_alpha_and_phi_must_lie_between_zero_and_one(name, value):
+    """α and φ are ratios between 0 and 1 (section 5)."""
     scene = pressed()
     raised_everywhere(
         lambda: scene.problem(coulomb(), scene.rollers(), **{name: value}), ValueError, name
@@ -409,8 +413,8 @@ def test_shares_out_of_range(name, value):
 
 @pytest.mark.whole
 @pytest.mark.parametrize("value", [0, -0.1, np.nan, "20 %", True])
-def test_small_displacement_tolerance_out_of_range(value):
-    """A positive number, infinite included."""
+def test_small_displacement_tolerance_must_be_positive(value):
+    """The small-displacement tolerance is positive and may be infinite."""
     scene = pressed()
     raised_everywhere(
         lambda: scene.problem(coulomb(), scene.rollers(), small_displacement_tolerance=value),
@@ -475,13 +479,13 @@ def estimated(scene: Block, value) -> None:
         ("estimate", estimated),
     ],
 )
-def test_neither_true_nor_false(name, call, value):
-    """Text and numbers are not taken by their truth: "no" would be true."""
+def test_boolean_options_must_be_true_or_false(name, call, value):
+    """Strings and numbers are refused, not converted to booleans: "no" would be true."""
     words = f"{name} is {value!r}", "True or False"
     raised_everywhere(lambda: call(pressed(), value), ValueError, *words)
 
 
-def test_increments_out_of_range():
+def test_increments_need_a_scalar_load_and_a_step():
     """`increments` needs a scalar constant and at least one step."""
     scene = pressed()
     problem, _ = scene.problem(coulomb(), scene.rollers())

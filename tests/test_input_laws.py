@@ -1,4 +1,4 @@
-"""Bad parameters of laws, gaps, normals and weights: an error that names them, on every rank."""
+"""Invalid parameters of laws, gaps, normals and weights are refused by name on all ranks."""
 
 import basix.ufl
 import numpy as np
@@ -36,7 +36,7 @@ BAD_NUMBERS = [
 @pytest.mark.whole
 @pytest.mark.parametrize(("name", "value"), BAD_NUMBERS)
 def test_parameter_out_of_range_by_number(name, value):
-    """μ < 0, k_n ≤ 0, k_t ≤ 0 and what is not finite, as numbers: refused by `Contact`."""
+    """`Contact` refuses the numbers μ < 0, k_n ≤ 0, k_t ≤ 0 and those that are not finite."""
     scene = pressed()
     raised_everywhere(lambda: scene.contact(coulomb(**{name: value})), ValueError, name, "contact")
 
@@ -44,7 +44,7 @@ def test_parameter_out_of_range_by_number(name, value):
 @pytest.mark.whole
 @pytest.mark.parametrize(("name", "value"), BAD_NUMBERS)
 def test_parameter_out_of_range_by_constant(name, value):
-    """The same as a ``fem.Constant``: refused by `ContactProblem`."""
+    """`ContactProblem` refuses a ``fem.Constant`` that is out of range."""
     scene = pressed()
     law = coulomb(**{name: fem.Constant(scene.mesh, float(value))})
     raised_everywhere(lambda: scene.problem(law, scene.rollers()), ValueError, name)
@@ -52,8 +52,8 @@ def test_parameter_out_of_range_by_constant(name, value):
 
 @pytest.mark.each
 @pytest.mark.parametrize(("name", "value"), BAD_NUMBERS)
-def test_parameter_changed_to_out_of_range(name, value):
-    """The same after a change of ``contact.parameters``: refused by the next solve, u unchanged."""
+def test_parameter_out_of_range_after_a_change(name, value):
+    """The next solve refuses a parameter set out of range, and leaves u unchanged."""
     scene = pressed()
     problem, contact = scene.problem(coulomb(), scene.rollers())
     problem.solve()
@@ -76,7 +76,7 @@ def test_parameter_changed_to_out_of_range(name, value):
     ids=["friction", "k_n", "k_t", "friction nan", "k_n inf"],
 )
 def test_parameter_out_of_range_by_ufl(name, expression):
-    """The same by UFL, at some points only; in parallel on some ranks only."""
+    """A UFL expression out of range at some points, in parallel on some ranks, is refused."""
     scene = pressed()
     law = coulomb(**{name: expression(ufl.SpatialCoordinate(scene.mesh))})
     raised_everywhere(lambda: scene.problem(law, scene.rollers()), ValueError, name)
@@ -84,7 +84,7 @@ def test_parameter_out_of_range_by_ufl(name, expression):
 
 @pytest.mark.parametrize("value", [-1.0, np.nan])
 def test_parameter_out_of_range_at_one_point(value):
-    """A function that is bad in one cell, so on one rank: all ranks raise."""
+    """All ranks raise if a function is out of range in one cell, thus on one rank."""
     scene = pressed()
     mu = fem.Function(fem.functionspace(scene.mesh, ("DG", 0)))
     mu.x.array[:] = 0.3
@@ -94,14 +94,14 @@ def test_parameter_out_of_range_at_one_point(value):
 
 
 def in_space() -> Block:
-    """A block of tetrahedra, pressed down."""
+    """Return a block of tetrahedra under a downward load."""
     return block("tetrahedron", up=-1.0)
 
 
 @pytest.mark.whole
 @pytest.mark.parametrize("value", [2, 0, -4, 3.5, "5", True])
-def test_polygon_of_too_few_sides(value):
-    """A polygon has a whole number of sides, three or more: refused by the law itself."""
+def test_number_of_polygon_sides_is_invalid(value):
+    """The law refuses a number of polygon sides that is not an integer of at least 3."""
     for law in (fc.Coulomb, lambda mu, **kwargs: fc.Tresca(mu, 1.0, **kwargs)):
         raised_everywhere(
             lambda law=law: law(0.3, modes=value), ValueError, "modes", repr(value), "at least 3"
@@ -115,15 +115,15 @@ def test_polygon_of_too_few_sides(value):
         ("transverse_friction", {"transverse_friction": 0.1, "direction": (1.0, 0.0)}),
     ],
 )
-def test_directions_of_friction_in_the_plane(name, options):
-    """Polygon and ellipse are of the tangent plane: none in two dimensions."""
+def test_friction_directions_in_two_dimensions(name, options):
+    """Polygonal and elliptic friction need a tangent plane: refused in two dimensions."""
     scene = pressed()
     law = fc.Coulomb(0.3, k_n=1e4, k_t=1e3, **options)
     raised_everywhere(lambda: scene.contact(law), ValueError, "contact", name, "two dimensions")
 
 
 def test_direction_of_friction_missing_or_unused():
-    """An ellipse without direction; a direction that the cone has no use for."""
+    """An ellipse without direction, and a direction for a circular cone, are refused."""
     raised_everywhere(
         lambda: fc.Coulomb(0.3, transverse_friction=0.1), ValueError, "direction", "missing"
     )
@@ -137,9 +137,9 @@ def elliptic(friction=0.3, transverse_friction=0.1, direction=(1.0, 0.0, 0.0)) -
 
 
 def test_elliptic_friction_is_solved():
-    """What the tests below spoil in one respect is sound otherwise: it carries its load, 1."""
+    """The valid input of the tests below is solved, with the load of 1 as the normal force."""
     step = build_and_solve(in_space(), elliptic())()
-    # Equilibrium to the solver's tolerance, 1e-9 of the forces.
+    # The residual is at most 1e-9 of the forces.
     assert step.contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
 
 
@@ -147,7 +147,7 @@ def test_elliptic_friction_is_solved():
 @pytest.mark.parametrize("value", [0.0, -0.1, np.nan, np.inf])
 @pytest.mark.parametrize("name", ["friction", "transverse_friction"])
 def test_axis_of_the_ellipse_out_of_range(name, value):
-    """Both frictions of an ellipse are greater than zero: as a number, a constant, by UFL."""
+    """Both coefficients of an ellipse must be positive, as a number, a constant or UFL."""
     scene = in_space()
     raised_everywhere(
         lambda: scene.contact(elliptic(**{name: value})), ValueError, name, "greater than zero"
@@ -171,14 +171,14 @@ def test_axis_of_the_ellipse_out_of_range(name, value):
     ],
 )
 def test_direction_of_friction_by_number(value, words):
-    """A direction that is none: refused by `Contact`."""
+    """`Contact` refuses a direction of length zero, of the wrong shape, or not finite."""
     scene = in_space()
     law = elliptic(direction=value)
     raised_everywhere(lambda: scene.contact(law), ValueError, "contact", "direction", *words)
 
 
 def test_direction_of_friction_parallel_to_the_normal():
-    """A direction with no part in the tangent plane, everywhere or at some points; later changed.
+    """A direction along the normal is refused, at all points, at some, or after a change.
 
     The normal of the floor is along z. In parallel only some ranks have such points.
     """
@@ -209,7 +209,7 @@ def test_direction_of_friction_parallel_to_the_normal():
     [("k_n", -1.0), ("k_n", np.inf), ("k_t", -1.0), ("k_t", np.nan)],
 )
 def test_foundation_out_of_range(name, value):
-    """Stiffness of a foundation, k_n, k_t ≥ 0; a number is refused at once, else at a solve."""
+    """A foundation needs k_n, k_t ≥ 0; `Contact` checks numbers, `ContactProblem` constants."""
     scene = pressed()
     numbers = {"k_n": 1e3, "k_t": 1e2}
     law = fc.Foundation(**numbers | {name: value})
@@ -218,8 +218,8 @@ def test_foundation_out_of_range(name, value):
     raised_everywhere(lambda: scene.problem(law, scene.rollers()), ValueError, name)
 
 
-def test_foundation_without_tangential_stiffness_at_some_points():
-    """k_t = 0 by a constant is sound: it means what the number zero means."""
+def test_foundation_with_constant_zero_tangential_stiffness():
+    """A constant k_t = 0 is valid and equivalent to the number zero."""
     scene = pressed()
     law = fc.Foundation(1e3, fem.Constant(scene.mesh, 0.0))
     step = build_and_solve(scene, law)()
@@ -229,7 +229,7 @@ def test_foundation_without_tangential_stiffness_at_some_points():
 
 @pytest.mark.parametrize("pressure", [-1.0, np.nan])
 def test_tresca_pressure_out_of_range(pressure):
-    """The prescribed pressure of Tresca's law is a pressure."""
+    """The pressure of Tresca's law must be nonnegative and finite."""
     scene = pressed()
     law = fc.Tresca(0.3, pressure, k_n=1e4, k_t=1e3)
     raised_everywhere(lambda: scene.contact(law), ValueError, "pressure")
@@ -238,13 +238,13 @@ def test_tresca_pressure_out_of_range(pressure):
 @pytest.mark.whole
 @pytest.mark.parametrize("value", ["rough", "0.3", True, 0.3 + 1j, {}, ["a", "b"], [[1.0], 2.0]])
 def test_parameter_of_a_wrong_type(value):
-    """What cannot be a coefficient is a TypeError that names the parameter."""
+    """A value that cannot be a coefficient raises a TypeError that names the parameter."""
     scene = pressed()
     raised_everywhere(lambda: scene.contact(coulomb(value)), TypeError, "friction")
 
 
-def test_whole_numbers_of_any_size():
-    """Python's integers have no end; 10**30 is 1e30, and what no float can hold is refused."""
+def test_large_integer_parameters():
+    """The integer 10**30 is read as 1e30; an integer beyond the range of floats is refused."""
     scene = block(n=2, up=-1.0)
     _, contact = scene.problem(fc.Frictionless(k_n=10**30), scene.rollers())
     assert contact.parameters["k_n"].value == 1e30
@@ -253,7 +253,7 @@ def test_whole_numbers_of_any_size():
 
 
 def test_parameter_none():
-    """None is no friction coefficient."""
+    """A friction coefficient of None is refused."""
     scene = pressed()
     raised_everywhere(
         lambda: scene.problem(coulomb(None), scene.rollers()), (ValueError, TypeError), "friction"
@@ -261,7 +261,7 @@ def test_parameter_none():
 
 
 def test_parameter_of_a_wrong_shape():
-    """A vector is no friction coefficient."""
+    """A friction coefficient that is a vector is refused."""
     scene = pressed()
     raised_everywhere(lambda: scene.contact(coulomb((0.1, 0.2))), ValueError, "friction", "scalar")
     x = ufl.SpatialCoordinate(scene.mesh)
@@ -271,7 +271,7 @@ def test_parameter_of_a_wrong_shape():
 @pytest.mark.whole
 @pytest.mark.parametrize("factor", [0.0, -1.0, np.nan, np.inf, "10"])
 def test_scaled_factor_out_of_range(factor):
-    """A factor of E/h is a positive number."""
+    """The factor of `RelativeStiffness` must be a positive finite number."""
     raised_everywhere(lambda: fc.RelativeStiffness(factor), ValueError, "factor")
 
 
@@ -282,7 +282,7 @@ def test_scaled_factor_out_of_range(factor):
 @pytest.mark.parametrize("kind", ["number", "constant", "ufl"])
 @pytest.mark.parametrize("name", ["gap", "weight"])
 def test_gap_or_weight_not_finite(name, kind):
-    """NaN in the prescribed gap or in the weight."""
+    """NaN in the prescribed gap or in the weight is refused."""
     scene = pressed()
     x = ufl.SpatialCoordinate(scene.mesh)
     value = {
@@ -296,7 +296,7 @@ def test_gap_or_weight_not_finite(name, kind):
 
 
 def test_negative_weight():
-    """A thickness is not negative, at any point."""
+    """A weight that is negative at some points is refused."""
     scene = pressed()
     weight = ufl.SpatialCoordinate(scene.mesh)[0] - 0.5
     raised_everywhere(
@@ -307,8 +307,8 @@ def test_negative_weight():
 
 
 @pytest.mark.parametrize("kind", ["number", "constant", "ufl"])
-def test_weight_of_zero(kind):
-    """A contact without any thickness would let the body through, without a word."""
+def test_weight_of_zero_at_every_point(kind):
+    """A weight of zero at every point, which would transmit no contact force, is refused."""
     scene = pressed()
     weight = {
         "number": 0.0,
@@ -323,8 +323,8 @@ def test_weight_of_zero(kind):
 
 
 @pytest.mark.parametrize("obstacle", ["obstacle", "half-space"])
-def test_normal_of_length_zero_at_a_point(obstacle):
-    """A normal by UFL that vanishes over one half of Γc: refused, as a normal of length zero."""
+def test_normal_of_length_zero_on_half_of_the_surface(obstacle):
+    """A UFL normal that vanishes on one half of Γc is refused."""
     scene = pressed()
     x = ufl.SpatialCoordinate(scene.mesh)
     normal = ufl.as_vector([0, ufl.conditional(ufl.gt(x[0], 0.5), -1.0, 0.0)])
@@ -338,7 +338,7 @@ def test_normal_of_length_zero_at_a_point(obstacle):
 
 
 def test_normal_not_finite():
-    """A normal by UFL that is NaN somewhere."""
+    """A UFL normal that is NaN at some points is refused."""
     scene = pressed()
     x = ufl.SpatialCoordinate(scene.mesh)
     obstacle = fc.PrescribedGap(0.0, ufl.as_vector([ufl.sqrt(x[0] - 0.5), -1.0]))
@@ -350,13 +350,13 @@ def test_normal_not_finite():
 
 
 def test_gap_of_a_wrong_shape():
-    """A prescribed gap is a scalar."""
+    """A prescribed gap that is a vector is refused."""
     scene = pressed()
     raised_everywhere(lambda: scene.contact(coulomb(), gap=(0.1, 0.2)), ValueError, "gap")
 
 
 def test_weight_of_a_wrong_shape():
-    """A weight is a scalar."""
+    """A weight that is a vector is refused."""
     scene = pressed()
     raised_everywhere(
         lambda: scene.problem(coulomb(), scene.rollers(), contact={"weight": (1.0, 2.0)}),
@@ -366,7 +366,7 @@ def test_weight_of_a_wrong_shape():
 
 
 def test_missing_modulus():
-    """A stiffness in units of E/h without E: `form` says so, with all the ways out."""
+    """`form` refuses a stiffness relative to E/h without E, and names the remedies."""
     scene = pressed()
     contact = scene.contact(fc.Coulomb(0.3))
     v = ufl.TestFunction(scene.u.function_space)
@@ -376,7 +376,7 @@ def test_missing_modulus():
 @pytest.mark.whole
 @pytest.mark.parametrize("modulus", [0.0, -1.0, np.nan, np.inf, "E", True])
 def test_modulus_out_of_range(modulus):
-    """A modulus is positive and finite."""
+    """A modulus must be a positive finite number."""
     scene = pressed()
     raised_everywhere(
         lambda: scene.contact(fc.Coulomb(0.3), modulus=modulus), ValueError, "modulus"
@@ -385,7 +385,7 @@ def test_modulus_out_of_range(modulus):
 
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
 def test_modulus_function_out_of_range(value):
-    """The same for a function that is bad in one cell at Γc."""
+    """A modulus function that is out of range in one cell at Γc is refused."""
     scene = pressed()
     modulus = fem.Function(fem.functionspace(scene.mesh, ("DG", 0)))
     modulus.x.array[:] = 1000.0
@@ -399,9 +399,9 @@ def test_modulus_function_out_of_range(value):
 @pytest.mark.whole
 @pytest.mark.parametrize("what", ["friction", "gap", "weight", "displacement", "normal"])
 def test_data_that_depend_on_the_displacement(what):
-    """Data are numbers while an increment is solved: what follows from u is none, and is named."""
+    """Data of the contact that depend on the unknown u are refused by name."""
     scene = pressed()
-    part = scene.u.sub(1)  # its array is that of u
+    part = scene.u.sub(1)  # has the same array as u
     grows = 0.3 + ufl.div(scene.u) ** 2
     contact = {
         "friction": {},
@@ -415,7 +415,7 @@ def test_data_that_depend_on_the_displacement(what):
 
 
 def test_data_of_another_mesh_or_form():
-    """A function on another mesh, or a test function, has no value at the points of Γc."""
+    """A function on another mesh, or a test function, is refused as friction coefficient."""
     scene, other = pressed(), pressed()
     far = coulomb(friction=0.3 + other.u[0] ** 2)
     raised_everywhere(lambda: scene.contact(far), ValueError, "friction", "another mesh")
@@ -427,7 +427,7 @@ DATA = ["friction", "gap", "weight"]
 
 
 def with_data(scene, what, value):
-    """A contact with one of its data given so."""
+    """Return a contact with one of its data set to a value."""
     contact = {} if what == "friction" else {what: value}
     return scene.contact(coulomb(friction=value if what == "friction" else 0.3), **contact)
 
@@ -435,7 +435,7 @@ def with_data(scene, what, value):
 @pytest.mark.whole
 @pytest.mark.parametrize("what", DATA)
 def test_data_in_single_precision(what):
-    """A constant of np.float32 cannot stand in a form of doubles."""
+    """A constant of np.float32 is refused, as forms are in double precision."""
     scene = pressed()
     value = fem.Constant(scene.mesh, np.float32(0.3))
     raised_everywhere(lambda: with_data(scene, what, value), ValueError, what, "float32", "double")
@@ -443,10 +443,10 @@ def test_data_in_single_precision(what):
 
 @pytest.mark.whole
 @pytest.mark.parametrize("what", DATA)
-def test_data_at_other_points(what):
-    """Values at quadrature points of cells, or of Γc by another rule, are none at those of Γc.
+def test_data_on_quadrature_elements(what):
+    """Values at quadrature points of cells, or of another rule on Γc, are refused.
 
-    Those of its own rule are, and give the force of the same number.
+    Values at the points of the contact's own rule give the force of the same number, to 1e-12.
     """
     scene = pressed()
 
@@ -473,7 +473,7 @@ def test_data_at_other_points(what):
 @pytest.mark.whole
 @pytest.mark.parametrize("what", DATA)
 def test_data_that_cannot_be_compiled(what):
-    """Areas of facets of quadrilaterals are known to no form compiler: said of what, and why."""
+    """An expression that FFCx cannot compile, the area of a facet, is refused by name."""
     scene = pressed()
     value = 0.1 * ufl.FacetArea(scene.mesh)
     words = what, "cannot be compiled", "FacetArea", "fem.Function"

@@ -1,6 +1,6 @@
-"""Meshes joined into one: what they contain, which tags it has, and what is refused.
+"""Tests of joined meshes: their cells and facets, their tags, and refused parts.
 
-Volumes and areas are those of the parts, added up in another order: 1e-12.
+Volumes and areas equal those of the parts, summed in another order, to 1e-12.
 """
 
 from __future__ import annotations
@@ -32,37 +32,37 @@ LOWER_HALF, REST = 7, 3
 
 
 def only(mesh: dolfinx.mesh.Mesh, tags: dolfinx.mesh.MeshTags, tag: Any) -> dict[str, Any]:
-    """For a measure, what has a tag (or several): always as 1, so that forms are the same."""
+    """Return measure arguments for one or several tags, renumbered to 1 so that forms are equal."""
     mine = tags.indices[np.isin(tags.values, tag)]
     ones = dolfinx.mesh.meshtags(mesh, tags.dim, mine, np.ones(len(mine), dtype=np.int32))
     return {"subdomain_data": ones, "subdomain_id": 1}
 
 
 def measure(mesh: dolfinx.mesh.Mesh, tags: dolfinx.mesh.MeshTags, tag: Any) -> float:
-    """Length, area or volume of what has a tag."""
+    """Return the length, area or volume of the entities with a tag."""
     kind = "dx" if tags.dim == mesh.topology.dim else "ds"
     return total(fem.Constant(mesh, 1.0) * ufl.Measure(kind, domain=mesh, **only(mesh, tags, tag)))
 
 
 def total(form: ufl.Form) -> float:
-    """The number that a form is, over all ranks."""
+    """Return the integral of a form over all ranks."""
     return COMM.allreduce(fem.assemble_scalar(fem.form(form)))
 
 
 def volume(mesh: dolfinx.mesh.Mesh) -> float:
-    """Of all cells."""
+    """Return the volume of all cells."""
     return total(fem.Constant(mesh, 1.0) * ufl.dx)
 
 
 def centre(mesh: dolfinx.mesh.Mesh, tags: dolfinx.mesh.MeshTags, tag: Any) -> np.ndarray:
-    """Integral of the coordinates over the cells that have a tag."""
+    """Return the integral of the coordinates over the cells with a tag."""
     x = ufl.SpatialCoordinate(mesh)
     dx = ufl.Measure("dx", domain=mesh, **only(mesh, tags, tag))
     return np.array([total(x[i] * dx) for i in range(mesh.geometry.dim)])
 
 
 def lower_half(mesh: dolfinx.mesh.Mesh, *, all_cells: bool = True) -> dolfinx.mesh.MeshTags:
-    """LOWER_HALF for cells whose middle is low; and REST for the others, or none."""
+    """Tag cells with a low midpoint as LOWER_HALF, and the others as REST or not at all."""
     d = mesh.topology.dim
     cells = mesh.topology.index_map(d)
     every = np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
@@ -85,10 +85,10 @@ def bend(x: np.ndarray) -> np.ndarray:
     ids=["straight", "curved"],
 )
 @pytest.mark.parametrize("cell", CELLS)
-def test_measures_by_tag_are_those_of_the_parts(
+def test_measures_by_tag_agree_with_those_of_the_parts(
     cell: str, curved: bool, ghost_mode: GhostMode
 ) -> None:
-    """Two blocks in the same place, one with half of its cells tagged."""
+    """Two blocks coincide, and in one of them only half of the cells are tagged."""
     options = {"shuffled": not curved, "ghost_mode": ghost_mode, "bend": bend if curved else None}
     parts = {}
     for name, n in (("coarse", 2), ("fine", 3)):
@@ -124,8 +124,8 @@ def test_measures_by_tag_are_those_of_the_parts(
 
 
 @pytest.mark.parametrize("cell", CELLS)
-def test_nodes_in_one_place_stay_two(cell: str) -> None:
-    """A body twice: twice the nodes, vertices and facets of the boundary; nothing is glued."""
+def test_coinciding_nodes_are_not_merged(cell: str) -> None:
+    """A mesh joined with itself has twice its nodes, vertices and boundary facets."""
     mesh, _ = block_mesh(cell)
     d = mesh.topology.dim
     joined = fc.join_meshes([mesh, mesh]).mesh
@@ -140,8 +140,8 @@ def test_nodes_in_one_place_stay_two(cell: str) -> None:
 
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
-def test_facets_inside_keep_their_tag(cell: str) -> None:
-    """A line through the middle, known to one rank alone for each facet, is tagged on all."""
+def test_interior_facets_keep_their_tag(cell: str) -> None:
+    """Tags of a line in the middle, given on one rank for each facet, are known on all ranks."""
     mesh, _ = block_mesh(cell, n=4)
     inner = dolfinx.mesh.locate_entities(mesh, 1, lambda x: np.isclose(x[1], 0.5))
     inner = inner[inner < mesh.topology.index_map(1).size_local]
@@ -152,20 +152,20 @@ def test_facets_inside_keep_their_tag(cell: str) -> None:
     mine = joined.facets.find(new)
     n_owned = joined.mesh.topology.index_map(1).size_local
     assert COMM.allreduce(np.count_nonzero(mine < n_owned)) == 4
-    # And every rank that has such a facet knows its tag.
+    # Every rank that has such a facet knows its tag.
     found = dolfinx.mesh.locate_entities(joined.mesh, 1, lambda x: np.isclose(x[1], 0.5))
     assert np.all(COMM.allgather(np.array_equal(np.sort(mine), np.sort(found))))
 
 
-def test_geometry_of_degree_three() -> None:
-    """Its nodes on edges have an order; joined, the volume is the same."""
+def test_cubic_geometry_keeps_its_volume() -> None:
+    """The order of the nodes on edges is kept, so that the volume of each part is the same."""
     nodes = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
     cells = np.array([[0, 1, 2], [3, 2, 1]])
     serial = mesh_of("triangle", nodes, cells, comm=MPI.COMM_SELF)
     places = fem.functionspace(serial, ("Lagrange", 3))
     x = places.tabulate_dof_coordinates()[:, :2]
     bent = x.copy()
-    bent[:, 1] *= 1 + 0.3 * x[:, 0] * (1 - x[:, 0] ** 2)  # the top is a cubic, over 1 + 0.3 / 4
+    bent[:, 1] *= 1 + 0.3 * x[:, 0] * (1 - x[:, 0] ** 2)  # a cubic top, area 1 + 0.3 / 4
     mesh = mesh_of("triangle", bent, places.dofmap.list, degree=3)
     one = volume(mesh)
     joined = fc.join_meshes([mesh, mesh])
@@ -175,8 +175,8 @@ def test_geometry_of_degree_three() -> None:
     assert one == pytest.approx(1.075)
 
 
-def test_numbers_by_body() -> None:
-    """A modulus for each body, as a function whose integral is that of the parts."""
+def test_values_by_body() -> None:
+    """The integral of values by body is the sum over the bodies; wrong values are refused."""
     meshes = [block_mesh("triangle", n=n, size=(1, h))[0] for n, h in ((2, 1.0), (3, 2.0))]
     joined = fc.join_meshes(meshes)
     assert joined.bodies == (0, 1)
@@ -190,8 +190,8 @@ def test_numbers_by_body() -> None:
         raised_everywhere(lambda values=values: joined.by_body(values), ValueError, *words)
 
 
-def test_a_body_on_one_rank_alone() -> None:
-    """Cells are distributed anew, wherever they were; ranks without any are nothing special."""
+def test_cells_are_redistributed_over_the_ranks() -> None:
+    """Cells that are all on the last rank are redistributed; ranks without cells are allowed."""
 
     def on_the_last(comm: MPI.Comm, n: int, types: Any, cells: Any) -> Any:
         return one_rank_each(np.full(cells[0].size // 4, n - 1))
@@ -206,8 +206,8 @@ def test_a_body_on_one_rank_alone() -> None:
         assert min(COMM.allgather(joined.mesh.topology.index_map(2).size_local)) > 0
 
 
-def test_unknown_bodies_and_tags() -> None:
-    """The error lists those that there are."""
+def test_unknown_bodies_and_tags_are_refused() -> None:
+    """The error lists the existing bodies or tags."""
     mesh, sides = block_mesh("triangle")
     joined = fc.join_meshes({"block": (mesh, None, sides)})
     raised_everywhere(lambda: joined.facet("ball", 1), ValueError, "'ball'", "['block']")
@@ -219,7 +219,7 @@ def test_unknown_bodies_and_tags() -> None:
 
 
 def quadratic(cell: str) -> dolfinx.mesh.Mesh:
-    """A block of geometric degree 2."""
+    """Return a block of geometric degree 2."""
     return block_mesh(cell, bend=lambda x: x)[0]
 
 
@@ -232,23 +232,23 @@ def quadratic(cell: str) -> dolfinx.mesh.Mesh:
     ],
     ids=["cell", "degree", "dimension"],
 )
-def test_meshes_that_do_not_go_together(other: Any, words: list[str]) -> None:
-    """Both are named."""
+def test_incompatible_meshes_are_refused(other: Any, words: list[str]) -> None:
+    """The error names both meshes and their difference."""
     parts = {"upper": block_mesh("triangle")[0], "lower": other()}
     raised_everywhere(lambda: fc.join_meshes(parts), ValueError, "'upper'", "'lower'", *words)
 
 
 @pytest.mark.skipif(COMM.size == 1, reason="one rank is all ranks")
-def test_meshes_of_other_ranks() -> None:
-    """A mesh that every rank has for itself is no part of one for all."""
+def test_meshes_of_another_communicator_are_refused() -> None:
+    """A mesh of one rank alone cannot be joined with a mesh of all ranks."""
     own = dolfinx.mesh.create_unit_square(MPI.COMM_SELF, 1, 1, CellType.triangle)
     parts = [block_mesh("triangle")[0], own]
     words = f"{COMM.size} ranks", "on 1", "communicator"
     raised_everywhere(lambda: fc.join_meshes(parts), ValueError, *words)
 
 
-def test_parts_that_are_none() -> None:
-    """What was given is named, and what is expected."""
+def test_wrong_parts_are_refused() -> None:
+    """The error names the given argument and the expected one."""
     mesh, sides = block_mesh("triangle")
     cells = mesh.topology.index_map(2)
     every = np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
@@ -272,8 +272,8 @@ def test_parts_that_are_none() -> None:
         fc.join_meshes([(mesh, None, far)])
 
 
-def test_a_mesh_with_another_variant_of_nodes() -> None:
-    """Of degree 3 nodes lie in other places by variant: refused, not moved."""
+def test_meshes_with_different_node_variants_are_refused() -> None:
+    """Nodes of degree 3 depend on the variant: the meshes are refused, the nodes not moved."""
     x, cells = np.array([[0.0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]])
     serial = mesh_of("triangle", x, cells, comm=MPI.COMM_SELF)
     made = []

@@ -1,7 +1,7 @@
-"""What every law must hold for any numbers: found by hypothesis, over twenty orders of magnitude.
+"""Properties of all contact laws for any numbers, by hypothesis over twenty orders of magnitude.
 
-The laws are evaluated as they are in a contact, compiled, at one point whose kinematics and
-parameters are coefficients. All references are numpy.
+The laws are compiled and evaluated as in a contact, at one point whose kinematics and parameters
+are coefficients. All references are computed by numpy.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from scenes.blocks import BOTTOM, block_mesh
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(200)]
 COMM = MPI.COMM_WORLD
 
-# The numbers that the laws are made with are of no account: every one of them is an argument.
+# The values in the constructors are irrelevant: every parameter is an argument of the point.
 AXES = {"transverse_friction": 1.0, "direction": (1, 0, 0)}
 PLANE = {
     "frictionless": fc.Frictionless(1.0),
@@ -61,10 +61,10 @@ EXACT = 1e-13
 
 
 class Point:
-    """A law at one point, its arguments coefficients."""
+    """A law at one point, with coefficients as arguments."""
 
     def __init__(self, law: Law, d: int) -> None:
-        """Compile it."""
+        """Compile the law."""
         mesh, tags = block_mesh(
             "quadrilateral" if d == 2 else "hexahedron", n=1, comm=MPI.COMM_SELF
         )
@@ -109,7 +109,7 @@ class Point:
         self.evaluate = PointEvaluator(quadrature, expressions)
 
     def __call__(self, arguments: dict) -> dict:
-        """The law's fields by name, for arguments by name."""
+        """Return the fields of the law by name, for arguments by name."""
         for name, place in self.slices.items():
             self.arguments.x.array.reshape(-1, self.size)[:, place] = arguments[name]
         fields = {name: value[0] for name, value in self.evaluate().items()}
@@ -124,7 +124,7 @@ class Point:
 
 @functools.cache
 def point(name: str, d: int) -> Point:
-    """The law of that name, compiled by one rank after the other: they share a cache."""
+    """Return the law of this name; ranks compile it one after another, as they share a cache."""
     made = None
     for rank in range(COMM.size):
         if rank == COMM.rank:
@@ -152,7 +152,7 @@ def unit_vectors(draw, d: int):
 
 
 def frame(n: np.ndarray) -> np.ndarray:
-    """Orthonormal tangent vectors, (d - 1, d)."""
+    """Return orthonormal tangent vectors, (d - 1, d)."""
     if len(n) == 2:
         return np.array([[-n[1], n[0]]])
     first = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
@@ -171,7 +171,7 @@ def tangents(draw, n: np.ndarray, lengths=sizes):
 
 @st.composite
 def arguments(draw, name: str, d: int, *, closed: bool = False):
-    """Arguments of a law; ``closed``: the gap is."""
+    """Draw arguments of a law; ``closed``: with a closed gap."""
     n = draw(unit_vectors(d))
     found = {"n": n, "gap": draw(signed), "u_n": draw(signed)}
     if closed:
@@ -190,7 +190,7 @@ def arguments(draw, name: str, d: int, *, closed: bool = False):
             found[key] = draw(powers if key[:2] == "k_" or name.endswith("ellipse") else sizes)
     if "transverse_friction" in SPACE[name].parameters():
         found["friction"] = draw(powers)
-        # Beyond that the stretch itself has lost the digits that are asked for.
+        # Beyond this ratio the scaling itself loses the digits that are tested.
         found["transverse_friction"] = found["friction"] * 10 ** draw(st.floats(-2, 2))
     return found
 
@@ -203,12 +203,12 @@ def ratio(a: dict) -> float:
 
 
 def loss(a: dict) -> float:
-    """By how much the stretch across the direction enlarges rounding."""
+    """Return the factor by which the scaling across the direction amplifies round-off."""
     return max(ratio(a), 1 / ratio(a))
 
 
 def axes(a: dict) -> np.ndarray:
-    """Along the direction and across it, (2, 3); without one along x, or y where x is normal."""
+    """Return the tangents along the direction (by default x, else y) and across it, (2, 3)."""
     given = a.get("direction", [1.0, 0, 0] if abs(a["n"][0]) < 0.9 else [0, 1.0, 0])
     first = given - (given @ a["n"]) * a["n"]
     first = first / np.linalg.norm(first)
@@ -216,7 +216,7 @@ def axes(a: dict) -> np.ndarray:
 
 
 def stiffness(a: dict) -> np.ndarray:
-    """K_t with the unit stiffness along the normal, so that it has an inverse."""
+    """Return K_t plus k_t along the normal, so that it has an inverse."""
     n = a["n"]
     if "transverse_friction" in a:
         first, second = axes(a)
@@ -227,17 +227,17 @@ def stiffness(a: dict) -> np.ndarray:
 
 
 def trial(a: dict) -> np.ndarray:
-    """τ* (44)."""
+    """Return τ* (44)."""
     return a["old"] - stiffness(a) @ a["moved"]
 
 
 def size(a: dict) -> float:
-    """Of the numbers that the traction is made of."""
+    """Return the magnitude of the terms of the traction."""
     return np.linalg.norm(a["old"]) + np.linalg.norm(stiffness(a) @ a["moved"])
 
 
 def corners(name: str, a: dict) -> np.ndarray:
-    """Points of the yield surface of limit one: all its corners, or many all around, (n, d)."""
+    """Return all corners of the yield surface of bound one, or many points on it, (n, d)."""
     law = SPACE[name]
     if len(a["n"]) == 2:
         return np.concatenate([frame(a["n"]), -frame(a["n"])])
@@ -251,7 +251,7 @@ def corners(name: str, a: dict) -> np.ndarray:
 
 
 def gauge(name: str, a: dict, tau: np.ndarray) -> float:
-    """The limit on whose yield surface τ lies."""
+    """Return the friction bound on whose yield surface τ lies."""
     law = SPACE[name]
     if len(tau) == 2:
         return abs(tau @ frame(a["n"])[0])
@@ -269,7 +269,7 @@ def gauge(name: str, a: dict, tau: np.ndarray) -> float:
 @properties
 @given(data=st.data())
 def test_complementarity(name, d, data):
-    """Eq. (3-11): no adhesion, and r_n δ₊ = 0 without any rounding; open means free."""
+    """Eq. (3-11) hold: no adhesion, r_n δ₊ = 0 without rounding, open points are free."""
     a = data.draw(arguments(name, d))
     r = point(name, d)(a)
     gap = a["gap"] - a["u_n"]
@@ -286,7 +286,7 @@ def test_complementarity(name, d, data):
 @properties
 @given(data=st.data())
 def test_normal_law_is_monotone(name, d, data):
-    """The farther the body moves to the obstacle, the more it is pushed back: exactly."""
+    """Pressure never decreases with the displacement towards the obstacle: exactly."""
     a = data.draw(arguments(name, d))
     b = a | {"u_n": data.draw(signed)}
     low, high = sorted((a, b), key=lambda x: x["u_n"])
@@ -299,14 +299,14 @@ def test_normal_law_is_monotone(name, d, data):
 @properties
 @given(data=st.data())
 def test_foundation(name, d, data):
-    """r_n = -k_n (u_n - s) and τ = -k_t u_t, in tension too or not; whatever happened before."""
+    """r_n = -k_n (u_n - s) and τ = -k_t u_t, with or without tension, for any history."""
     a = data.draw(arguments(name, d))
     r = point(name, d)(a)
     acts = name == "foundation" or a["u_n"] > a["gap"]
     normal = a["k_n"] * (a["gap"] - a["u_n"]) if acts else 0.0
     tangential = -a["k_t"] * a["u_t"] if acts else 0 * a["u_t"]
     assert abs(r["r_n"] - normal) <= EXACT * abs(normal)
-    # Products below the smallest normal number are rounded by more.
+    # Products below the smallest normal number have larger rounding errors.
     assert np.all(
         np.abs(r["tau"] - tangential) <= EXACT * np.abs(tangential) + np.finfo(float).tiny
     )
@@ -322,7 +322,7 @@ def test_foundation(name, d, data):
 def test_cone_and_flow(name, d, data):
     """Eq. (44): g ≤ 0, Δβ ≥ 0, Δβ_j g_j = 0, Δτ = -K_t (Δu_t + Σ Δβ_j ∂g_j/∂τ).
 
-    The limit is μ p, the surface that of numpy, and so is K_t.
+    The friction bound is μ p; the yield surface and K_t are those computed by numpy.
     """
     a = data.draw(arguments(name, d, closed=True))
     r = point(name, d)(a)
@@ -331,7 +331,7 @@ def test_cone_and_flow(name, d, data):
     assert abs(limit - expected) <= EXACT * expected
     exact = EXACT * loss(a)
     assert gauge(name, a, tau) <= (1 + exact) * limit
-    # Where adherence alone leaves little of large terms, their rounding is what counts.
+    # If τ* is a small difference of large terms, their rounding dominates.
     adherence = gauge(name, a, trial(a))
     rounding = exact * size(a) * (limit / adherence if adherence > limit else 1.0)
     assert abs(g.max() + limit - gauge(name, a, tau)) <= exact * limit + rounding
@@ -344,7 +344,7 @@ def test_cone_and_flow(name, d, data):
     excess = a["k_t"] * beta.max()
     assert np.all(a["k_t"] * beta * np.abs(g) <= exact * limit * max(excess, limit))
     returned = trial(a) - tau
-    if limit > 0:  # of no size, the surface has no normal
+    if limit > 0:  # a yield surface of zero size has no normal
         flow = stiffness(a) @ (beta @ r["gradients"])
         assert np.abs(returned - flow).max() <= exact * size(a)
 
@@ -353,10 +353,10 @@ def test_cone_and_flow(name, d, data):
 @properties
 @given(data=st.data())
 def test_traction_is_the_closest_point(name, d, data):
-    """No admissible traction is nearer to τ* in the metric of K_t, and slip gives no energy back.
+    """The traction is the point closest to τ* in the metric of K_t, and slip dissipates energy.
 
-    The closest point of a convex set is the one with (τ* - τ)·K_t⁻¹ (s - τ) ≤ 0 for all s of the
-    set; for s = 0 that is the dissipation -τ·(Δu_t + K_t⁻¹ Δτ) ≥ 0.
+    The closest point of a convex set satisfies (τ* - τ)·K_t⁻¹ (s - τ) ≤ 0 for all s of the set; for
+    s = 0 this is the dissipation -τ·(Δu_t + K_t⁻¹ Δτ) ≥ 0.
     """
     a = data.draw(arguments(name, d, closed=True))
     r = point(name, d)(a)
@@ -373,8 +373,8 @@ def test_traction_is_the_closest_point(name, d, data):
 @pytest.mark.parametrize(("name", "d"), ALL)
 @properties
 @given(data=st.data())
-def test_energies(name, d, data):
-    """½ k_n δ² and ½ τ·K_t⁻¹ τ are stored, never negative; the slip's work is dissipated (44)."""
+def test_stored_and_dissipated_energy(name, d, data):
+    """½ k_n δ² and ½ τ·K_t⁻¹ τ are stored, never negative; the work of slip is dissipated (44)."""
     a = data.draw(arguments(name, d, closed=True))
     r = point(name, d)(a)
     law = SPACE[name]
@@ -382,7 +382,7 @@ def test_energies(name, d, data):
     expected = a["k_n"] / 2 * penetration**2 if law.has_normal_stiffness else 0.0
     if law.has_tangential:
         expected += r["tau"] @ np.linalg.solve(stiffness(a), r["tau"]) / 2
-    # Across the direction the metric has the square of the stretch.
+    # Across the direction the metric contains the square of the scaling.
     exact = 10 * EXACT * loss(a) ** 2
     assert abs(r["stored"] - expected) <= exact * expected and r["stored"] >= 0
     if law.has_friction:
@@ -409,12 +409,12 @@ def test_polygon_by_brute_force(sides, data):
             share = np.clip((start - p) @ (q - p) / length, 0, 1) if length > 0 else 0.0
             candidates.append(p + share * (q - p))
         expected = min(candidates, key=lambda c: np.linalg.norm(start - c))
-    # How far along a side the point lies is told by τ*, with its rounding.
+    # The position along a side follows from τ*, with its rounding.
     assert np.abs(r["tau"] - expected).max() <= EXACT * size(a)
 
 
 def test_polygon_has_all_cases():
-    """Of tractions all around, some stick, some lie on one side, some at a vertex (two modes)."""
+    """Tractions in all directions stick, or lie on one side, or at a vertex (two modes)."""
     law = point("pentagon", 3)
     active = set()
     for turn in np.linspace(0, 6.2, 50):
@@ -430,7 +430,7 @@ def test_polygon_has_all_cases():
 @properties
 @given(data=st.data())
 def test_traction_is_monotone(name, d, data):
-    """(τ - τ')·(Δu_t - Δu_t') ≤ 0 at one limit: friction resists, by no more than adherence."""
+    """(τ - τ')·(Δu_t - Δu_t') ≤ 0 at equal bound, and in magnitude at most that of stick."""
     a = data.draw(arguments(name, d, closed=True))
     b = a | {"moved": data.draw(tangents(a["n"]))}
     difference = point(name, d)(a)["tau"] - point(name, d)(b)["tau"]
@@ -442,17 +442,17 @@ def test_traction_is_monotone(name, d, data):
 
 # ---- symmetries ----------------------------------------------------------------------------------
 
-# The frame of a polygon without direction is tied to the axes.
+# The frame of a polygon without direction depends on the coordinate axes.
 SCENES = [(name, d) for name, d in ALL if name != "free polygon"]
 
 
 def moved_rigidly(a: dict, q: np.ndarray) -> dict:
-    """The scene, turned or mirrored."""
+    """Return the arguments, rotated or mirrored by q."""
     return {name: q @ value if np.ndim(value) else value for name, value in a.items()}
 
 
 def same_scene(name: str, a: dict, b: dict, q: np.ndarray, order: np.ndarray) -> None:
-    """The law's answer to b is that to a, turned, with the modes in another order."""
+    """Check that the law's result for b is that for a, transformed by q, with modes reordered."""
     d = len(a["n"])
     one, other = point(name, d)(a), point(name, d)(b)
     assert other["r_n"] == one["r_n"]
@@ -473,7 +473,7 @@ def modes(name: str, d: int, *, mirrored: bool) -> np.ndarray:
 
 
 def rotation(axis: np.ndarray, angle: float, d: int) -> np.ndarray:
-    """By Rodrigues' formula; in the plane by the angle."""
+    """Return the rotation matrix, in 3D by Rodrigues' formula."""
     if d == 2:
         return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     cross = np.cross(np.eye(3), -axis)
@@ -484,7 +484,7 @@ def rotation(axis: np.ndarray, angle: float, d: int) -> np.ndarray:
 @properties
 @given(data=st.data())
 def test_objectivity(name, d, data):
-    """The scene turned: the traction turns with it, all else stays."""
+    """The traction rotates with the scene; everything else is unchanged."""
     a = data.draw(arguments(name, d))
     q = rotation(data.draw(unit_vectors(d)), data.draw(angles), d)
     assert np.allclose(q @ q.T, np.eye(d), atol=1e-14) and np.linalg.det(q) > 0
@@ -495,7 +495,7 @@ def test_objectivity(name, d, data):
 @properties
 @given(data=st.data())
 def test_reflection(name, d, data):
-    """The scene mirrored: the traction is, and the modes change places with their images."""
+    """The traction is mirrored with the scene; the modes are exchanged with their images."""
     a = data.draw(arguments(name, d))
     m = data.draw(unit_vectors(d))
     q = np.eye(d) - 2 * np.outer(m, m)

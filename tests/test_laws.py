@@ -1,4 +1,4 @@
-"""The laws: residual and tangent as derivatives, parameters, and what is symmetric."""
+"""Contact laws: residual and tangent as derivatives, symmetry, and parameters."""
 
 from dataclasses import dataclass
 
@@ -53,7 +53,7 @@ ALL_LAWS = LAWS | LAWS_3D
 
 @dataclass(frozen=True)
 class State:
-    """Displacement along the normal and across it; the same of the last commit, if there is one."""
+    """Normal and tangential displacement, and optionally those of the last commit."""
 
     name: str
     normal: float
@@ -67,7 +67,7 @@ STATES = [
     State("open", -0.2, 0.004),
     State("stick", 0.2, 0.004),
     State("slip", 0.2, 0.3),
-    # Traction of the last commit: 60 * 0.012 = 0.7; then back through zero, or on.
+    # Traction of the last commit: 60 * 0.012 = 0.7; then reversed, to stick or slip.
     State("stick with history", 0.2, -0.006, (0.2, 0.012)),
     State("slip with history", 0.2, -0.3, (0.2, 0.012)),
     # Committed while slipping, so that β and a traction on the cone are in the history.
@@ -77,10 +77,10 @@ STATES = [
 
 
 class Scene:
-    """An oblique obstacle over two sides of a shuffled mesh, and one law."""
+    """Contact of two sides of a shuffled mesh with an oblique obstacle, for one law."""
 
     def __init__(self, cell: str, degree: int, law: fc.Law) -> None:
-        """Make the contact; u is zero."""
+        """Create the contact with u = 0."""
         self.d = dimension(cell)
         self.degree = degree
         mesh, tags = block_mesh(cell, shuffled=True)
@@ -92,7 +92,7 @@ class Scene:
         self.contact = fc.Contact(self.u, surface, obstacle, law)
 
     def displace(self, normal: float, tangential: float, seed: int) -> None:
-        """Set u to a mean along and across the normal, and a small polynomial."""
+        """Set u to mean normal and tangential displacements plus a small polynomial."""
         n = NORMAL[self.d] / np.linalg.norm(NORMAL[self.d])
         t = np.linalg.svd(n[None])[2][1]
         t *= np.sign(t[0])  # the sign of a null vector is not defined
@@ -101,7 +101,7 @@ class Scene:
         self.u.interpolate(lambda x: mean[:, None] + field(x))
 
     def enter(self, state: State) -> None:
-        """Put every point in the state, which is checked."""
+        """Bring every point into the given state, and check it."""
         self.contact.history.function.x.array[:] = 0.0
         if state.committed is not None:
             self.displace(*state.committed, seed=1)
@@ -118,7 +118,7 @@ class Scene:
 
 
 def central(scene: Scene, direction: np.ndarray, evaluate, h: float = 1e-5):
-    """Central difference of ``evaluate()`` at u along a direction."""
+    """Return the central difference of ``evaluate()`` at u along a direction."""
     at = owned(scene.u).copy()
     ends = []
     for sign in (1, -1):
@@ -143,15 +143,15 @@ def directions(scene: Scene) -> list[np.ndarray]:
     [
         (cell, degree, law)
         for cell, degree in GRID
-        # A law acts on points: for what is of space alone one degree will do.
+        # A law acts on points: one degree suffices for laws of 3D only.
         for law in (LAWS if dimension(cell) == 2 or degree > 1 else ALL_LAWS)
     ],
 )
 def test_residual_and_tangent_are_derivatives(cell, degree, law):
-    """δΠ = residual and δ(residual) = tangent, by central differences, in every state.
+    """Central differences show δΠ = residual and δ(residual) = tangent in every state.
 
-    Tolerance 1e-6: with h = 1e-5 and states of size 0.1 the truncation is h²/0.1² = 1e-8 where the
-    law is curved (the cone) and none elsewhere; rounding is 1e-16/h = 1e-11.
+    Tolerance 1e-6: with h = 1e-5 and states of size 0.1 the truncation error is h²/0.1² = 1e-8
+    where the law is curved (the cone) and zero elsewhere; round-off is 1e-16/h = 1e-11.
     """
     scene = Scene(cell, degree, ALL_LAWS[law])
     contact, space = scene.contact, scene.space
@@ -175,14 +175,14 @@ def test_residual_and_tangent_are_derivatives(cell, degree, law):
             if potential is not None:
                 difference = central(scene, direction, lambda: assemble_number(potential, COMM))
                 exact = COMM.allreduce(float(r @ direction))
-                # In size the work could be as large as all its parts.
+                # Relative to the sum of the magnitudes of all terms of the work.
                 size = COMM.allreduce(float(np.abs(r * direction).sum()))
                 assert abs(difference - exact) <= 1e-6 * size, state.name
             x.array[:] = direction
             tangent.mult(x, y)
             difference = central(scene, direction, lambda: assemble_owned(residual, space))
             difference, exact = gathered(COMM, difference), gathered(COMM, y.array)
-            # Where the tangent vanishes, rounding of the residual over h is what is left.
+            # Where the tangent vanishes, the round-off of the residual divided by h remains.
             assert close(difference, exact, 1e-6, scale=max(np.abs(exact).max(), 1e-4)), state.name
         check_shape(scene, state, law, gathered(COMM, r), tangent)
         for thing in (tangent, x, y):
@@ -190,7 +190,7 @@ def test_residual_and_tangent_are_derivatives(cell, degree, law):
 
 
 def check_shape(scene: Scene, state: State, law: str, r: np.ndarray, tangent: PETSc.Mat) -> None:
-    """What vanishes and what is symmetric: without this 0 = 0 would pass as a derivative."""
+    """Check what is zero and what is symmetric: 0 = 0 would pass as a derivative."""
     kind = state.name.split()[0]
     size = tangent.norm(PETSc.NormType.FROBENIUS)
     unilateral = law.startswith(("frictionless", "coulomb", "compliance"))
@@ -200,7 +200,7 @@ def check_shape(scene: Scene, state: State, law: str, r: np.ndarray, tangent: PE
         return
     assert np.abs(r).max() > 1e-3, state.name
     if law == "prescribed" and kind == "slip" and scene.d == 2:
-        # The traction is constant then, and so is the normal one.
+        # Both the tangential and the normal traction are constant.
         assert size <= 1e-12 * K_N
         return
     assert size > 1.0, state.name
@@ -220,10 +220,10 @@ def check_shape(scene: Scene, state: State, law: str, r: np.ndarray, tangent: PE
     [(cell, law) for cell in CELLS for law in ("coulomb", "foundation")]
     + [("tetrahedron", "coulomb, ellipse"), ("hexahedron", "coulomb, polygon")],
 )
-def test_stiffness_is_the_tangent_of_closed_and_sticking(cell, law):
-    """The springs with full shares equal the consistent tangent where all points stick.
+def test_full_contact_springs_equal_the_sticking_tangent(cell, law):
+    """The springs with full stiffness equal the consistent tangent where all points stick.
 
-    Round-off: two ways of summing the same products.
+    Tolerance 1e-13: round-off of the same products summed in a different order.
     """
     scene = Scene(cell, 1, ALL_LAWS[law])
     scene.enter(STATES[1])
@@ -243,7 +243,7 @@ def test_stiffness_is_the_tangent_of_closed_and_sticking(cell, law):
 
 
 def traction_by_hand(scene: Scene, mu, k_n, k_t) -> np.ndarray:
-    """Return map of one increment from no history, in numpy, at the points of all ranks."""
+    """Return the tractions of a return map without history, in numpy, at all points."""
     x = gathered(COMM, scene.contact.points)
     field = polynomial(scene.d, scene.degree, 2, 0.002)
     n = NORMAL[scene.d] / np.linalg.norm(NORMAL[scene.d])
@@ -259,7 +259,7 @@ def traction_by_hand(scene: Scene, mu, k_n, k_t) -> np.ndarray:
 
 @pytest.mark.parametrize("cell", CELLS)
 def test_parameters_vary_over_the_surface(cell):
-    """μ, k_n and k_t as UFL of x: the traction is the return map with their values at each point.
+    """With μ, k_n and k_t as UFL of x, tractions are the return map with the values at each point.
 
     Reference: numpy. Tolerance 1e-12: round-off of some ten operations on each point.
     """
@@ -284,9 +284,9 @@ def test_parameters_vary_over_the_surface(cell):
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_parameters_change_without_compiling(cell, monkeypatch):
-    """``contact.parameters[name].value`` takes effect in values, form and tangent; no compilation.
+    """``contact.parameters[name].value`` changes values, form and tangent without compilation.
 
-    Reference: numpy, and for the tangent that it scales with both stiffnesses. Round-off 1e-12.
+    Reference: numpy, to 1e-12 (round-off); of the tangents only that their norms differ.
     """
     scene = Scene(cell, 1, LAWS["coulomb"])
     contact, space = scene.contact, scene.space
@@ -299,7 +299,7 @@ def test_parameters_change_without_compiling(cell, monkeypatch):
         raise AssertionError("a form was compiled")
 
     monkeypatch.setattr(dolfinx.jit, "ffcx_jit", refuse)
-    # The guard itself works: a new form does not get through.
+    # The guard works: compiling a new form fails.
     with pytest.raises(AssertionError, match="compiled"):
         fem.form(contact.form(v), entity_maps=contact.entity_maps)
     scene.displace(0.2, 0.03, seed=2)
@@ -327,9 +327,9 @@ def test_parameters_change_without_compiling(cell, monkeypatch):
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_weight_multiplies_the_form_and_the_resultants(cell):
-    """``weight`` enters form, potential and resultants alike, and leaves tractions as they are.
+    """``weight`` multiplies form, potential and resultants, and leaves tractions unchanged.
 
-    Reference: the same contact with weight one; a weight of 2.5 is exact but for round-off.
+    Reference: the same contact with weight one; a weight of 2.5 is exact to round-off, 1e-13.
     """
     plain = Scene(cell, 1, LAWS["tresca"])
     contacts = [plain.contact]
@@ -359,7 +359,7 @@ def test_weight_multiplies_the_form_and_the_resultants(cell):
 
 @pytest.mark.parametrize("cell", CELLS)
 def test_scaled_stiffness_is_a_multiple_of_modulus_over_height(cell):
-    """`RelativeStiffness` with a given modulus: k_n = factor E/h, cell height h = 1/3.
+    """`RelativeStiffness` with a given modulus gives k_n = factor E/h, cell height h = 1/3.
 
     Tolerance 1e-9: the E/h field is smoothed by an iterative solve (1e-14) of its logarithm.
     """

@@ -1,7 +1,8 @@
-"""Bodies that nothing but contact holds stay where their load leaves them, and where all slips.
+"""Bodies constrained by contact alone: their position after unloading, and if all points slip.
 
-The tangent along friction is none: a body all of whose points slip is loose along its obstacle, and
-one without a load has an equilibrium wherever it is.
+At a slipping point the tangent has no stiffness along the friction force: a body all of whose
+points slip is unconstrained along its obstacle, and a body without load is in equilibrium at every
+position.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ BULKS = {"linear": LinearElastic, "rubber": NeoHookean}
 
 
 class Free:
-    """A block of the size 1 on a floor that moves along, its traction on the top."""
+    """A block of size 1, with a traction on its top, on a floor that moves tangentially."""
 
     def __init__(self, cell, bulk, n=3, friction=0.3, size=1.0, modulus=1e3, gap=0.0, **options):
-        """Make it of n cells along a side, in units of length and stress."""
+        """Build the block with n cells along each side, in the given units of length and stress."""
         d, self.size, self.unit = dimension(cell), size, modulus / 1e3
         mesh, tags = block_mesh(cell, n=n)
         mesh.geometry.x[:] *= size
@@ -57,7 +58,7 @@ class Free:
         self.problem = fc.ContactProblem(F, self.u, contacts=[self.contact])
 
     def go(self, side, press, along=0.0):
-        """Solve an increment: its iterations, and how far Γc is along the floor by its size."""
+        """Solve an increment; return iterations and Γc's mean displacement along x by the size."""
         self.traction.value[[0, -1]] = side * self.unit, -press * self.unit
         self.shift.value[0] = along * self.size
         step = self.problem.solve()
@@ -78,12 +79,13 @@ class Free:
 @pytest.mark.parametrize("along", [0.0, 5.0])
 @pytest.mark.parametrize("side", [0.0, 0.1, 0.2])
 @pytest.mark.parametrize("gap", [0.0, 0.5])
-def test_a_block_that_is_let_go_stays(gap, side, along, bulk, kinematics):
-    """Pressed, pushed and carried along, let go, and pressed again.
+def test_released_block_keeps_its_position(gap, side, along, bulk, kinematics):
+    """A block is pressed, pushed and moved by the floor, then released, and pressed again.
 
-    Reference: where the floor has carried it, to 1e-3, the strain by which it springs back. Rubber
-    drifted by 0.1 to 35 of its size, in up to 65 iterations, and with small displacements a linear
-    block went back by all of the way, and was pressed again from where it had begun: in 40 to 670.
+    Reference: the displacement of the floor, to 1e-3, the strain by which the block springs back.
+    Rubber drifted by 0.1 to 35 times its size, in up to 65 iterations. With small displacements a
+    linear block returned to its initial position and was pressed again from there, in 40 to 670
+    iterations.
     """
     scene = Free("quadrilateral", bulk, gap=gap, kinematics=kinematics)
     first, _ = scene.go(side, 1.0)
@@ -100,11 +102,11 @@ def test_a_block_that_is_let_go_stays(gap, side, along, bulk, kinematics):
     ("bulk", "kinematics"), [("linear", "small"), ("linear", "finite"), ("rubber", "finite")]
 )
 @pytest.mark.parametrize("way", [(0.3, -0.05), (0.3, 0.1), (-0.3, -0.3)])
-def test_a_floor_takes_along_the_block_that_is_let_go(way, bulk, kinematics):
-    """While its load goes, in one increment: it sticks to the floor as long as any load is left.
+def test_block_moves_with_the_floor_while_it_is_unloaded(way, bulk, kinematics):
+    """The block is unloaded and the floor moves in one increment; it sticks until the load is zero.
 
-    Reference: the way of the floor, to the strain. With small displacements the block was left
-    behind, or the increment refused.
+    Reference: the displacement of the floor, to the strain (0.02). With small displacements the
+    block was left behind, or the increment was refused.
     """
     scene = Free("quadrilateral", bulk, kinematics=kinematics)
     scene.go(3.0, 20.0)
@@ -117,8 +119,8 @@ def test_a_floor_takes_along_the_block_that_is_let_go(way, bulk, kinematics):
 
 @pytest.mark.parametrize("size", [1.0, 1e-4])
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron", "hexahedron"])
-def test_rubber_that_is_let_go_stays_in_any_units(cell, size):
-    """In the plane and in space; reference: as above."""
+def test_released_rubber_block_keeps_its_position_in_any_units(cell, size):
+    """Rubber blocks in the plane and in space keep their position when released, to 1e-3."""
     units = {"size": size, "modulus": 1e3 / size**2}
     scene = Free(cell, "rubber", n=2, gap=0.1, kinematics="finite", **units)
     scene.go(0.1, 1.0)
@@ -131,11 +133,11 @@ def test_rubber_that_is_let_go_stays_in_any_units(cell, size):
 @pytest.mark.parametrize("bulk", BULKS)
 @pytest.mark.parametrize("friction", [0.02, 0.1])
 @pytest.mark.parametrize("n", [1, 2, 3])
-def test_all_points_slip(n, friction, bulk):
-    """Outwards, under a block that is pressed: only their sum holds it along the floor.
+def test_block_is_constrained_if_all_points_slip(n, friction, bulk):
+    """All points of a pressed block slip outwards: only their resultant constrains it tangentially.
 
-    Reference: the load, and the place, to the strain of 1e-3. Rubber took up to 67 iterations, or
-    was refused.
+    Reference: the load, and the position, to the strain of 1e-3. Rubber took up to 67 iterations,
+    or was refused.
     """
     scene = Free("quadrilateral", bulk, n=n, friction=friction, kinematics="finite")
     for side, press in ((0.0, 1.0), (0.5 * friction, 1.0), (0.0, 0.0)):
@@ -145,10 +147,10 @@ def test_all_points_slip(n, friction, bulk):
 
 
 class OnASlab:
-    """A block of rubber of the size 1, with traction on its top, over a slab that moves."""
+    """A block of rubber of size 1, with a traction on its top, on a slab that moves."""
 
     def __init__(self, slab, block, *, simplex):
-        """Make them of the coordinates along x and up that cut them."""
+        """Mesh slab and block with the given grid coordinates along x and y."""
         (floor, lower), (upper, top) = (axes[1][[0, -1]] for axes in (slab, block))
         mesh, tags = boxes(
             [slab, block],
@@ -172,7 +174,7 @@ class OnASlab:
         self.problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[self.contact])
 
     def go(self, side, press, place=(0.0, 0.0)):
-        """Solve an increment, and commit."""
+        """Solve an increment with the slab displaced by ``place``, and commit."""
         self.traction.value[:] = side, -press
         for constant, value in zip(self.place, place, strict=True):
             constant.value = value
@@ -183,11 +185,11 @@ class OnASlab:
 
 @pytest.mark.parametrize("bulk", BULKS)
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_a_block_in_a_bowl_slips_on_both_edges(kinematics, bulk):
-    """The curvature of the bowl alone holds it against rolling, and friction of 0.05 does not.
+def test_block_in_a_bowl_slips_on_both_edges(kinematics, bulk):
+    """Only the curvature of the bowl prevents rolling; friction of 0.05 does not.
 
     Reference: statics of the outermost points, to 1 %, by which the bowl closes on the bent block.
-    With finite kinematics the load was cut to 1/256 of it, and refused.
+    With finite kinematics the load was cut to 1/256, and refused.
     """
     radius, friction, load = 2.0, 0.05, 0.02
     edges = [np.linspace(-0.5, 0.5, 7), np.linspace(0.0, 1.0, 7)]
@@ -207,16 +209,17 @@ def test_a_block_in_a_bowl_slips_on_both_edges(kinematics, bulk):
     steps = list(fc.increments(problem, press, 0.0, load, steps=4, max_cuts=0))
     assert sum(step.iterations for step in steps) <= 40
     found = contact.resultants()
-    assert found.stick + found.slip == 2  # one may be at its limit, and not beyond it
+    assert found.stick + found.slip == 2  # one may be at its friction bound, still sticking
     x = np.abs(gathered(COMM, contact.points)[:, 0]).max()
     sine, cosine = x / radius, np.sqrt(1 - (x / radius) ** 2)
     assert close(found.normal_force, load / (cosine - friction * sine), 0.01)
 
 
-def test_blocks_of_rubber_that_are_let_go_touch():
-    """Not more than by round-off of where they were pressed together, which is no fault.
+def test_released_rubber_block_keeps_its_contact():
+    """A released block may penetrate by the round-off of its position; this is no failure.
 
-    Reference: the other block. One was refused for a depth of 1e-11 between two points of Γc.
+    Reference: a gap of zero to the other block, to 1e-3. A solution was refused for a penetration
+    of 1e-11 between two points of Γc.
     """
     block, slab = np.linspace(0, 1, 3), np.linspace(-1, 2, 7)
     scene = OnASlab([slab, np.linspace(-1.1, -0.1, 3)], [block - 0.06, block], simplex=True)
@@ -225,11 +228,11 @@ def test_blocks_of_rubber_that_are_let_go_touch():
     assert np.abs(scene.contact.gap).max(initial=0.0) < 1e-3
 
 
-def test_a_block_that_was_let_go_is_set_down_on_a_slab():
-    """Where it hovers over it again. Reference: the load.
+def test_released_block_is_positioned_on_the_slab_again():
+    """A released block is above the slab and is loaded again. Reference: the load, to 1e-8.
 
-    Of its points those that round-off had closed held it at first, and Newton's method took 71
-    iterations, or gave up.
+    At first only those points constrained it that round-off had closed; Newton's method took 71
+    iterations, or failed.
     """
     slab = [np.linspace(-1, 3, 17), np.linspace(0, 1, 5)]
     block = [np.linspace(0.5, 1.5, 7), np.linspace(1.4, 2.4, 5)]
@@ -244,14 +247,14 @@ def test_a_block_that_was_let_go_is_set_down_on_a_slab():
 def _stack(
     blocks: list[tuple[float, float, int, float, float]], friction: float
 ) -> tuple[fc.ContactProblem, fem.Constant, fem.Constant, Bodies]:
-    """Blocks of rubber, E = 1000, one above the other, 2 cells high, of which the highest is moved.
+    """Stack rubber blocks, E = 1000, each 2 cells high, with prescribed motion of the top.
 
     Args:
-        blocks: Left and right end, cells along it, lower and upper end of each, from below.
-        friction: Coefficient.
+        blocks: Left and right end, cells along x, lower and upper end of each block, from below.
+        friction: Coefficient of friction.
 
     Returns:
-        The problem, the displacements of the top up and aside, and the bodies.
+        The problem, the vertical and the horizontal displacement of the top, and the bodies.
     """
     axes = [[np.linspace(a, b, n + 1), np.linspace(*ends, 3)] for a, b, n, *ends in blocks]
     faces = {}
@@ -272,7 +275,7 @@ def _stack(
 
 
 def _between_two(n: int, m: int) -> tuple[fc.ContactProblem, fem.Constant, Bodies]:
-    """A block m cells wide, 0.01 from both others, n and m + 2 cells wide."""
+    """Stack a block m cells wide, 0.01 from both others, which are n and m + 2 cells wide."""
     blocks = [(0, 1, n, 0, 0.3), (0.2, 0.8, m, 0.31, 0.51), (0.3, 0.7, m + 2, 0.52, 0.72)]
     problem, up, _, bodies = _stack(blocks, 0.6)
     return problem, up, bodies
@@ -280,11 +283,12 @@ def _between_two(n: int, m: int) -> tuple[fc.ContactProblem, fem.Constant, Bodie
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("law", [fc.Coulomb(0.3), fc.Tresca(0.3, 1e-3)])
-def test_what_prescribed_values_carry_along_does_not_slip(law, kinematics):
-    """A block set down on a slab slips by the same, to 1e-6, at rest and carried along with it.
+def test_common_prescribed_displacement_causes_no_slip(law, kinematics):
+    """A block on a slab slips equally, to 1e-6, whether both are at rest or displaced together.
 
-    Both are led aside by prescribed values, the block by those of its left side, one node of which
-    is on the slab. That would slip by all of the path if the others were taken to stay behind.
+    Both are displaced tangentially by Dirichlet values, the block by those of its left side, one
+    node of which is on the slab. This node would slip by the whole displacement if the other nodes
+    were assumed to stay behind.
     """
     forces = []
     for carried in (0.0, 2.0):
@@ -312,11 +316,12 @@ def test_what_prescribed_values_carry_along_does_not_slip(law, kinematics):
 
 
 @pytest.mark.parametrize(("n", "m"), [(8, 4), (8, 5)])
-def test_no_block_is_thrown_out_from_between_two_others(n, m):
-    """A step of the iteration threw the middle one out sideways, and all was in balance, at zero.
+def test_block_between_two_others_is_not_ejected(n, m):
+    """A Newton step ejected the middle block sideways, and all forces balanced, at zero.
 
-    References: what presses on it from both sides is equal, for it has no load, and as much, to
-    5 %, as where it is not thrown out, of other cells: 0.0264 to 0.0267 E. Without cuts.
+    References: the forces on both sides of the middle block, which has no load, are equal, to 1e-6,
+    and agree, to 5 %, with those of other meshes on which it is not ejected: 0.0264 to 0.0267 E.
+    The increment is not cut.
     """
     problem, down, _ = _between_two(n, m)
     (step,) = fc.increments(problem, down, 0.0, -0.05, steps=1, max_cuts=0)
@@ -325,11 +330,12 @@ def test_no_block_is_thrown_out_from_between_two_others(n, m):
     assert close(upper[1], 0.0265 * 1e3, 0.05)
 
 
-def test_no_block_that_has_borne_force_is_thrown_out():
-    """Five blocks pressed together, then the top is moved aside, in four increments.
+def test_block_with_previous_contact_force_is_not_ejected():
+    """Five blocks are pressed together, then the top moves sideways, in four increments.
 
-    The middle one went aside by 0.74, off the others, and all was verified, at no force at all.
-    Reference: (-3.967, 21.321) on the lowest joint in forty increments, to 1 %; the path counts.
+    The middle block was ejected by 0.74 from between the others, and the solution was accepted
+    without any force. Reference: (-3.967, 21.321) on the lowest joint in forty increments, to 1 %;
+    the result depends on the load path.
     """
     blocks = [
         (0, 1, 4, 0, 0.184),
@@ -348,11 +354,11 @@ def test_no_block_that_has_borne_force_is_thrown_out():
     assert np.linalg.norm(force - [-3.967, 21.321]) < 0.01 * 21.7
 
 
-def test_a_body_that_is_thrown_out_is_told_of():
-    """By name, with its way and that of all else; not one that goes as far as others do.
+def test_ejected_body_is_reported():
+    """An ejected body is named, with its displacement and the largest nearby; others are not.
 
-    References: the displacements given: the middle one 2 aside, where it touches nothing; the
-    highest one at rest, or 1 up.
+    References: the prescribed displacements: the middle block moves by 2 sideways, where it touches
+    nothing; the highest one is at rest, or moves up by 1, and then none is reported.
     """
     problem, _, blocks = _between_two(6, 4)
     u, before = problem.u, problem.full.state()
@@ -371,12 +377,12 @@ def test_a_body_that_is_thrown_out_is_told_of():
     ("bulk", "kinematics"), [("linear", "small"), ("linear", "finite"), ("rubber", "finite")]
 )
 @pytest.mark.parametrize("n_steps", [1, 4])
-def test_a_stack_springs_back(n_steps, bulk, kinematics):
-    """Three free blocks on a floor, soft, stiff and between, pressed on the top and let go.
+def test_unloaded_stack_springs_back(n_steps, bulk, kinematics):
+    """Three free blocks on a floor, soft, stiff and of medium stiffness, are pressed and released.
 
-    All go by what the soft one had been compressed by, no force is left on any, and that is not far
-    away. References: the load on every joint, 1e-8, and no displacement, to 1e-6 of the size, by
-    what residuals of 1e-9 leave on the soft one.
+    All are displaced by the compression of the soft one, and no force remains on any; this is no
+    ejection. References: the load on every joint, to 1e-8, and zero displacement, to 1e-6 of the
+    size, due to residuals of 1e-9 on the soft block.
     """
     axes = [[np.linspace(-0.3, 0.3, 4), np.linspace(k, k + 1.0, 3)] for k in range(3)]
     faces = {1: near(1, 0.0), 6: near(1, 3.0)}
@@ -407,10 +413,11 @@ def test_a_stack_springs_back(n_steps, bulk, kinematics):
 
 @pytest.mark.parametrize("slope", [0.1, 0.02])
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_a_wedge_that_jaws_push_out_is_not_thrown_out(kinematics, slope):
-    """Without a load, between rigid jaws that close by 0.1 of the slope each, in one increment.
+def test_wedge_displaced_by_closing_jaws_is_not_taken_for_ejected(kinematics, slope):
+    """A wedge without load is between rigid jaws that close by 0.1 times the slope each.
 
-    Reference: geometry, 0.1 up, to 1e-4, ten and fifty times what anything else moves by.
+    Reference: geometry, 0.1 upwards in one increment, to 1e-4, ten and fifty times any other
+    displacement.
     """
     lines = [[np.linspace(-0.3, 0.3, 4), np.linspace(0.0, 1.0, 5)]]
     faces = {LEFT: near(0, -0.3), RIGHT: near(0, 0.3)}
@@ -441,11 +448,11 @@ def test_a_wedge_that_jaws_push_out_is_not_thrown_out(kinematics, slope):
 
 
 @pytest.mark.parametrize("way", [2.5, 3.5])
-def test_a_body_that_a_floor_has_thrown_is_told_of(way):
-    """One that is farther away than three times what the floor has moved by.
+def test_body_displaced_beyond_the_moving_floor_is_reported(way):
+    """A block is reported if its displacement exceeds three times that of the floor.
 
-    References: the displacements given: the block by `way` along the floor, which moves by 1, and
-    by 0.5 off it.
+    References: the prescribed displacements: the block moves by `way` along the floor, which moves
+    by 1, and by 0.5 away from it.
     """
     scene = Free("quadrilateral", "linear", kinematics="finite")
     problem, u = scene.problem, scene.u
@@ -460,11 +467,12 @@ def test_a_body_that_a_floor_has_thrown_is_told_of(way):
     assert all(close(np.array(ways), expected, 1e-12) for ways in found.values())
 
 
-def test_a_body_that_a_ball_has_thrown_off_a_wall_is_told_of():
-    """From the floor and a wall at rest, by 1, as a ball moves 0.02 into it; no force acts on it.
+def test_body_displaced_off_a_wall_by_a_ball_is_reported():
+    """A block without force is displaced by 1 off a wall at rest; a ball moves into it by 0.02.
 
-    Nothing but a force holds it where it was: no motion gets it out from between ball and floor.
-    References: the displacements given. The wall's normals took all that is along them for pushed.
+    Only a force can keep it at its initial position: no rigid-body motion resolves the penetration
+    between ball and floor. References: the prescribed displacements, to 1e-12. All displacement
+    along the wall's normal used to be attributed to the wall.
     """
     scene = Beside({"block": Box(n=(4, 4))}, E=1e3)
     down = scene.bodies.constant((0.0, 0.0))
@@ -487,10 +495,11 @@ def test_a_body_that_a_ball_has_thrown_off_a_wall_is_told_of():
 
 
 @pytest.mark.parametrize(("way", "is_ejected"), [(2.5, False), (3.5, True)])
-def test_the_residual_of_an_ejected_body_is_no_number(way, is_ejected):
-    """After an increment with force: the block off the floor that had carried it, which moves by 1.
+def test_residual_of_an_ejected_body_is_nan(way, is_ejected):
+    """After an increment with force, an unloaded block is displaced off its moving floor.
 
-    Reference: the displacements given, of a body without load; whether the residual is NaN.
+    Reference: the prescribed displacement, at most, or more than, three times that of the floor, 1;
+    whether the residual is NaN.
     """
     scene = Free("quadrilateral", "rubber", kinematics="finite")
     scene.go(0.0, 1.0)
@@ -507,11 +516,12 @@ def test_the_residual_of_an_ejected_body_is_no_number(way, is_ejected):
 
 @pytest.mark.parametrize("bulk", ["linear", "rubber"])
 @pytest.mark.parametrize("way", [0.003, 0.1])
-def test_a_block_lifted_off_a_moving_floor(way, bulk):
-    """In one increment: friction may take the block along, by at most the floor's way.
+def test_lifted_block_moves_at_most_with_the_floor(way, bulk):
+    """The block is lifted in one increment; friction moves it by at most the floor's displacement.
 
-    Reference: the interval. The consistent tangent extrapolates friction beyond the loss of
-    pressure, which threw the block the other way by six times that of the floor.
+    Reference: this interval, with 1e-3 of that displacement. The consistent tangent extrapolates
+    friction beyond the loss of pressure, which displaced the block in the opposite direction by six
+    times the displacement of the floor.
     """
     scene = Beside({"block": Box()}, rubber=bulk == "rubber")
     up, shift = scene.bodies.constant(), fem.Constant(scene.bodies.mesh, np.zeros(2))
@@ -526,11 +536,11 @@ def test_a_block_lifted_off_a_moving_floor(way, bulk):
     assert place.min() > -1e-3 * way and place.max() < 1.001 * way
 
 
-def test_a_block_left_on_the_floor_does_not_hinder_the_one_lifted():
-    """What is left on a mode without forces is round-off of those on others, and none of it felt.
+def test_block_left_on_the_floor_does_not_slow_newtons_method():
+    """The residual of a rigid-body mode without forces is round-off of other forces, and ignored.
 
-    Taken for forces that are not in balance it stiffened all open points: Newton's method went in
-    steps of a fifth, and another method needed 32 iterations.
+    Taken for unbalanced forces it stiffened all open points: Newton's method took steps of a fifth,
+    and another method needed 32 iterations.
     """
     mesh, tags = two_blocks("triangle", (3, 4))
     u = fem.Function(displacement_space(mesh, 1))
@@ -560,11 +570,12 @@ def test_a_block_left_on_the_floor_does_not_hinder_the_one_lifted():
         assert borne > 100.0 if place == pressed else borne < 1e-6
 
 
-def test_a_block_in_a_bowl_is_let_go_and_pressed_again():
-    """Without load it rests anywhere; that it would move a little farther there is no error.
+def test_block_in_a_bowl_is_unloaded_and_loaded_again():
+    """The unloaded block is in equilibrium anywhere; a slight further displacement is no error.
 
-    With small displacements it touches by the gap of the undeformed body, and is 2e-8 inside of
-    the bowl where it is. What this does to the forces is round-off: the block moves out of the way.
+    With small displacements contact is determined by the gap of the undeformed body, and the
+    displaced block penetrates the bowl by 2e-8. The resulting force is round-off, because the block
+    moves away.
     """
     mesh, tags = block_mesh("quadrilateral", n=4)
     u = fem.Function(displacement_space(mesh, 1))
@@ -589,13 +600,14 @@ def test_a_block_in_a_bowl_is_let_go_and_pressed_again():
     ("kinematics", "rubber"), [("small", False), ("finite", False), ("finite", True)]
 )
 @pytest.mark.parametrize(("n", "modulus"), [(2, 1e3), (4, 1e9)])
-def test_friction_without_pressure_takes_a_block_along(n, modulus, kinematics, rubber):
-    """A floor moves off a block without load; Tresca friction acts at its open points, too.
+def test_friction_without_pressure_moves_the_block_with_the_floor(n, modulus, kinematics, rubber):
+    """A floor moves off a block without load; Tresca friction acts at the open points, too.
 
-    Nothing holds the block along the normal: displaced by 1e10 of its size it was verified with a
-    force of 0.1 on it. References: no balance at such a state, by the forces there, which are at
-    the friction bound; the way of the floor along itself and none across, to 1e-3 of it (nothing
-    holds the block across); no force, the load, to 1e-8 of the pressure.
+    Nothing constrains the block along the normal: displaced by 1e10 times its size it was accepted
+    with a force of 0.1. References: no equilibrium at such a state, relative to the forces there,
+    which are at the friction bound; the tangential displacement of the floor and no normal one, to
+    1e-3 of it (nothing constrains the block along the normal); zero force, as the load is, to 1e-8
+    of the pressure.
     """
     scene = Beside({"block": Box(size=(1.0, 0.5), n=(2 * n, n))}, E=modulus, rubber=rubber)
     pressure, shift = 1e-3 * modulus, scene.bodies.constant((0.0, 0.0))
@@ -613,17 +625,17 @@ def test_friction_without_pressure_takes_a_block_along(n, modulus, kinematics, r
     assert np.abs(contact.resultants().force).max() < 1e-8 * pressure
     way = gathered(COMM, (problem.full.state() - before).reshape(-1, 2))
     assert np.abs(way - (0.01, 0.0)).max() < 1e-5
-    if not rubber:  # which inverts by round-off there
+    if not rubber:  # rubber inverts by round-off at this distance
         away = before + 1e10 * problem.motions.of_bodies[1]
         assert np.isfinite(equations.residual_at(equations.system.restrict(away)))
         assert not equations.norms.is_within(1e-9)
 
 
 class Pushed:
-    """A block without load, a block at its left that is led, a gap of 0.2 between them, and a ball.
+    """An unloaded block, a driven block at its left, a gap of 0.2 between them, and a ball.
 
-    The ball, with finite kinematics only, is 0.1 above the block where its middle is at 1.15. All
-    is turned by an angle.
+    The ball, with finite kinematics only, is 0.1 above the block and has its centre at x = 1.15.
+    The whole scene is rotated by an angle.
     """
 
     def __init__(
@@ -638,7 +650,7 @@ class Pushed:
         far=None,
         **options,
     ):
-        """Put the block at a place, and, if it is said how far, another away from all."""
+        """Put the block at ``place``, and an unrelated one at the distance ``far`` if given."""
         c, s = np.cos(angle), np.sin(angle)
         self.turn = np.array([[c, -s], [s, c]])
 
@@ -669,7 +681,7 @@ class Pushed:
         self.problem = scene.problem(*self.contacts, **options)
 
     def step(self, along=None):
-        """Solve and commit an increment, the one that is led somewhere along."""
+        """Solve and commit an increment, with the driven block displaced to ``along`` if given."""
         if along is not None:
             for constant, share in zip(self._led, self.turn[:, 0], strict=True):
                 constant.value = share * along
@@ -677,7 +689,7 @@ class Pushed:
         self.problem.commit()
 
     def push(self, n_steps):
-        """Lead the one 0.85 to the right and back by 0.7: the other is to be left at 0.65."""
+        """Drive the one block 0.85 to the right and back by 0.7; the other must stay at 0.65."""
         for start, end in ((0.0, 0.85), (0.85, 0.15)):
             for along in start + (end - start) * np.arange(1, n_steps + 1) / n_steps:
                 self.step(along)
@@ -703,17 +715,18 @@ class Pushed:
 @pytest.mark.parametrize(
     ("kinematics", "rubber"), [("small", False), ("finite", False), ("finite", True)]
 )
-def test_a_block_without_load_stays_where_it_was_pushed(kinematics, rubber, options, n_steps):
-    """Reference: geometry, the way of the other less the gap, to 1e-7.
+def test_unloaded_block_stays_where_another_block_pushed_it(kinematics, rubber, options, n_steps):
+    """Reference: geometry, the displacement of the other block minus the gap, to 1e-7.
 
-    It was taken back with the other; and L-BFGS, for which every place will do, lifted it.
+    The block was moved back with the other one; and L-BFGS, to which all positions are equivalent,
+    lifted it.
     """
     Pushed(kinematics=kinematics, rubber=rubber, **options).push(n_steps)
 
 
 @pytest.mark.parametrize("rubber", [False, True])
-def test_a_block_that_was_pushed_bears_a_ball(rubber):
-    """Reference: the force on the ball where the block is meshed there, to 1e-6; it was zero."""
+def test_displaced_block_carries_the_force_of_a_ball(rubber):
+    """Reference: the force on the ball if the block is meshed there, to 1e-6; it was zero."""
     forces = []
     for place in (0.0, 0.65):
         scene = Pushed(place, rubber=rubber)

@@ -1,4 +1,4 @@
-"""A load that has a maximum: the error says so, and by displacement it is passed."""
+"""Limit points are reported under force control and passed under displacement control."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ PEAK, REACH = 2.0, 0.01
 
 @dataclass(frozen=True)
 class Separation(Law):
-    """r_n = e t₀ (g/d) exp(-g/d): it pulls with t₀ at most, at the gap d (Xu and Needleman)."""
+    """r_n = e t₀ (g/d) exp(-g/d) has the largest tension t₀ at the gap d (Xu and Needleman)."""
 
     strength: float
     reach: float
 
     @property
     def has_tension(self) -> bool:
-        """It pulls where open."""
+        """The law has tension where the gap is open."""
         return True
 
     def contact_traction(
         self, kinematics: PointKinematics, parameters: Mapping[str, Expr]
     ) -> ContactTraction:
-        """Of the gap alone."""
+        """Return the normal traction, which depends on the gap only."""
         x = kinematics.gap / parameters["reach"]
         pull = np.e * parameters["strength"] * x * ufl.exp(-x)
         return ContactTraction(pull)
 
     def normal_potential(self, kinematics: PointKinematics, parameters: Mapping[str, Expr]) -> Expr:
-        """Its derivative by the gap is r_n."""
+        """Return the potential, whose derivative with respect to the gap is r_n."""
         d = parameters["reach"]
         return -np.e * parameters["strength"] * (kinematics.gap + d) * ufl.exp(-kinematics.gap / d)
 
 
 def pulled(by):
-    """A block of the size 1 that is glued to the floor, and pulled at its top by "force" or not."""
+    """Return a block of size 1 glued to a floor, pulled by "force" or else by displacement."""
     scene = block("quadrilateral", n=2, E=1e3, nu=0.0, up=0.0)
     led = fem.Constant(scene.mesh, 0.0)
     bcs = [] if by == "force" else [scene.hold(TOP, 1, led)]
@@ -60,8 +60,8 @@ def pulled(by):
     return problem, load
 
 
-def test_a_force_ends_at_the_maximum():
-    """Closed form: the load that area and strength can bear, to the least increment, 0.25/64."""
+def test_force_control_stops_at_the_maximum_load():
+    """The last load is area times strength, to twice the smallest increment, 0.25/64."""
     problem, load = pulled("force")
     reached = []
 
@@ -73,8 +73,8 @@ def test_a_force_ends_at_the_maximum():
     assert PEAK - 2 * 0.25 / 64 <= reached[-1] <= PEAK
 
 
-def test_a_displacement_passes_it():
-    """Closed form: column and glue in series, p = u/(1/E) - g = r_n(g), before and behind."""
+def test_displacement_control_passes_the_maximum_load():
+    """Column and glue in series have p = r_n(u - p/E), to 1e-6, before and after the peak."""
     problem, load = pulled("displacement")
     forces = []
     for step in fc.increments(problem, load, 0.0, 5 * REACH, steps=25):
@@ -85,8 +85,8 @@ def test_a_displacement_passes_it():
     assert max(forces) == pytest.approx(PEAK, rel=2e-2) and forces[-1] < 0.3 * PEAK
 
 
-def test_what_fails_before_is_no_maximum():
-    """Without iterations nothing converges, wherever the load is: nothing is said of a maximum."""
+def test_other_failures_are_not_reported_as_limit_point():
+    """A failure below the maximum, here without iterations, is not reported as a limit point."""
     problem, load = pulled("force")
     history = fc.increments(problem, load, 0.0, 1.0, steps=4)
     next(history)

@@ -1,4 +1,4 @@
-"""Meshes from gmsh models and arrays: what is read, and what is refused on every rank."""
+"""Meshes from gmsh models and arrays: valid input, and input that is refused on every rank."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LEFT, RIGHT, BOTTOM, TOP = 3, 4, 5, 6
 
 @pytest.fixture
 def model() -> Iterator[Any]:
-    """Two rectangles, 2 x 1 and 1 x 1, that share the side at x = 2; on the first rank, meshed."""
+    """Yield rectangles, 2 x 1 and 1 x 1, with a common side at x = 2; on the first rank."""
     gmsh.initialize()
     gmsh.option.setNumber("General.Terminal", 0)
     gmsh.model.add("plates")
@@ -38,7 +38,7 @@ def model() -> Iterator[Any]:
 
 
 def lines_at(height: float) -> list[int]:
-    """Lines of the model at y = ``height``."""
+    """Return the lines of the model at y = ``height``."""
     box = (-1, height - 0.1, -1, 9, height + 0.1, 1)
     return [line for _, line in gmsh.model.getEntitiesInBoundingBox(*box, 1)]
 
@@ -54,7 +54,7 @@ def measure(form: ufl.Form) -> float:
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_tags_of_cells_and_facets(model: Any, order: int) -> None:
-    """Each group has the measure of what was put into it."""
+    """Each tag has the measure of the entities of its group."""
     group(2, [1], LEFT), group(2, [2], RIGHT)
     if COMM.rank == 0:
         group(1, lines_at(0), BOTTOM), group(1, lines_at(1), TOP)
@@ -73,7 +73,7 @@ def test_tags_of_cells_and_facets(model: Any, order: int) -> None:
 
 
 def test_no_group_of_facets(model: Any) -> None:
-    """Tags that no facet has."""
+    """Without a group of facets no facet is tagged."""
     group(2, [1, 2], 1)
     if COMM.rank == 0:
         model.mesh.generate(2)
@@ -81,8 +81,8 @@ def test_no_group_of_facets(model: Any) -> None:
     assert facets.dim == 1 and facets.indices.size == 0
 
 
-def test_another_rank(model: Any) -> None:
-    """The first rank has no model where another one is said to have it."""
+def test_rank_without_a_model_is_refused(model: Any) -> None:
+    """A model on the first rank is refused if another rank is given."""
     group(2, [1, 2], 1)
     if COMM.rank == 0:
         model.mesh.generate(2)
@@ -93,8 +93,8 @@ def test_another_rank(model: Any) -> None:
         )
 
 
-def test_what_is_refused(model: Any) -> None:
-    """On all ranks, and before the mesh is made."""
+def test_invalid_models_are_refused(model: Any) -> None:
+    """Invalid models are refused on all ranks, before the mesh is created."""
 
     def refused(*words: str) -> None:
         raised_everywhere(lambda: fc.model_to_mesh(model, COMM, gdim=2), ValueError, *words)
@@ -132,7 +132,7 @@ def test_what_is_refused(model: Any) -> None:
 
 # ---- arrays --------------------------------------------------------------------------------------
 
-# Two squares, 1 x 1, that share the side at x = 1; and a point of no cell.
+# Two squares, 1 x 1, with a common side at x = 1, and a point without a cell.
 SQUARES = {
     "points": [[0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1], [9, 9]],
     "cells": [[0, 1, 4, 3], [1, 2, 5, 4]],
@@ -143,7 +143,7 @@ SQUARES = {
 
 
 def from_arrays(rank: int = 0, **changes: Any) -> tuple[Any, Any, Any]:
-    """The mesh of the squares, or of what is changed of them; arrays are on one rank alone."""
+    """Return the mesh of the squares, with these changes; the arrays are on one rank alone."""
     given = SQUARES | changes
     mine = COMM.rank == rank
     arrays = {
@@ -173,7 +173,7 @@ def test_arrays_with_tags(rank: int) -> None:
 
 
 def test_arrays_in_the_order_of_dolfinx() -> None:
-    """The third node of a quadrilateral is then opposite to the second."""
+    """In DOLFINx's order the third node of a quadrilateral is opposite to the second."""
     cells = np.array(SQUARES["cells"])[:, [0, 1, 3, 2]]
     mesh, tags, _ = from_arrays(cells=cells, node_order="dolfinx")
     dx = ufl.Measure("dx", domain=mesh, subdomain_data=tags)
@@ -181,7 +181,7 @@ def test_arrays_in_the_order_of_dolfinx() -> None:
 
 
 def gmsh_grid(kind: str, order: int) -> tuple[Any, Any, Any]:
-    """Points, cells and the facets at x = 0 of a unit square or cube, by the gmsh of rank 0."""
+    """Return points, cells and facets at x = 0 of a unit square or cube, by gmsh on rank 0."""
     gmsh.initialize()
     gmsh.option.setNumber("General.Terminal", 0)
     occ, mesh = gmsh.model.occ, gmsh.model.mesh
@@ -219,7 +219,7 @@ def gmsh_grid(kind: str, order: int) -> tuple[Any, Any, Any]:
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("kind", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
 def test_arrays_of_every_cell_type(kind: str, order: int) -> None:
-    """Volume, and area and place of the tagged side, of cells as gmsh numbers them."""
+    """Volume, and area and position of the tagged side, are right in gmsh's node order."""
     points, cells, side = gmsh_grid(kind, order) if COMM.rank == 0 else (None, None, None)
     facets = {LEFT: side, TOP: []} if COMM.rank == 0 else None
     mesh, tags, sides = fc.mesh_from_arrays(
@@ -240,7 +240,7 @@ def test_arrays_of_every_cell_type(kind: str, order: int) -> None:
 
 
 def test_arrays_in_a_contact() -> None:
-    """The weight of two squares on a floor is what the floor carries."""
+    """The contact force of two squares on a floor is their weight."""
     mesh, _, facets = from_arrays()
     V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
     u, v = fem.Function(V), ufl.TestFunction(V)
@@ -252,8 +252,8 @@ def test_arrays_in_a_contact() -> None:
     assert contact.resultants().normal_force == pytest.approx(10.0)
 
 
-def test_arrays_that_are_refused() -> None:
-    """On all ranks; the text says what was given and what to give."""
+def test_invalid_arrays_are_refused() -> None:
+    """Invalid arrays are refused on all ranks; the error says what was given and what to give."""
 
     def refused(*words: str, **changes: Any) -> None:
         raised_everywhere(lambda: from_arrays(**changes), ValueError, *words)
@@ -290,7 +290,7 @@ def test_arrays_that_are_refused() -> None:
 
 
 def test_arrays_by_meshio(tmp_path: Any) -> None:
-    """What meshio reads from an Abaqus file, as the page shows it."""
+    """Arrays that meshio reads from an Abaqus file are accepted, as the documentation shows."""
     meshio = pytest.importorskip("meshio")
     file = COMM.bcast(tmp_path / "squares.inp")
     arrays = (None, None, None)

@@ -1,4 +1,4 @@
-"""Mistakes of a first script: each is refused or warned of on all ranks, and nothing is silent."""
+"""Typical mistakes in scripts are refused or warned of on all ranks; none is ignored."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ MAX_COORDINATE = 77
 
 
 def bulk(scene, ds, tag):
-    """The scene's stiffness, and a pressure of one on a tag of the measure."""
+    """Return a bulk form with a unit pressure on a tag of the measure."""
     v = ufl.TestFunction(scene.u.function_space)
     eps = ufl.sym(ufl.grad(scene.u))
     return ufl.inner(1000 * eps, ufl.grad(v)) * ufl.dx + v[1] * ds(tag)
 
 
 @pytest.mark.parametrize("scheme", ["default", "vertex"])
-def test_numbers_printed_otherwise(scheme):
-    """Quadrature elements have printed numbers in their names: no others after set_printoptions.
+def test_quadrature_elements_do_not_depend_on_print_options(scheme):
+    """Printed numbers in the names of quadrature elements do not depend on set_printoptions.
 
-    Equal ones of two names in a form end, by chance, in a KeyError of FFCx: names are compared.
+    Equal elements of different names in a form may cause a KeyError of FFCx: names are compared.
     """
     scene = pressed(surface={"quadrature_scheme": scheme})
     quadrature = scene.contact(coulomb()).quadrature
@@ -50,46 +50,46 @@ def test_numbers_printed_otherwise(scheme):
         assert after == before and repr(after) == repr(before)
 
 
-def test_points_that_are_printed_alike():
-    """Those of degree 3 and 4, six a triangle: at each the values are those of its own places.
+def test_samples_do_not_depend_on_print_options():
+    """Rules of degree 3 and 4, both of six points, give values at their own points (1e-14).
 
-    Of three ranks one has no cells.
+    The points print alike. Of three ranks one has no cells.
     """
     mesh = dolfinx.mesh.create_unit_square(COMM, 1, 1)
     x = ufl.SpatialCoordinate(mesh)
     with np.printoptions(formatter={"float": lambda _: "."}):
         for degree in (3, 4):
             places, values = output.sample(x[0] ** 5, mesh, degree)
-            # The same expression in NumPy, to its round-off.
+            # The reference is the same expression in NumPy, to round-off.
             assert values == pytest.approx(places[:, 0] ** 5, abs=1e-14)
             rule, _ = basix.make_quadrature(basix.CellType.triangle, degree)
             assert places[:, 0].min() == pytest.approx(rule.min(), abs=1e-14)
 
 
 def problem_of(scene, F=None, bcs=None):
-    """On the bottom, by any form."""
+    """Return a problem with contact at the bottom and a given form."""
     bcs = scene.rollers() if bcs is None else bcs
     if F is None:
         return scene.problem(coulomb(), bcs)[0]
     return fc.ContactProblem(F, scene.u, bcs=bcs, contacts=[scene.contact(coulomb())])
 
 
-def test_the_order_of_a_problem():
-    """Function and form swapped."""
+def test_swapped_function_and_form_are_refused():
+    """The error for swapped function and form states their order."""
     scene = pressed()
     F = bulk(scene, ufl.ds(scene.mesh, subdomain_data=scene.tags), TOP)
     raised_everywhere(lambda: fc.ContactProblem(scene.u, F), ValueError, "ContactProblem(F, u)")
 
 
-def test_an_energy_for_a_residual():
-    """It is said how to make one of it."""
+def test_energy_instead_of_a_residual_is_refused():
+    """The error states how to derive a residual from the energy."""
     scene = pressed()
     energy = ufl.inner(ufl.grad(scene.u), ufl.grad(scene.u)) * ufl.dx
     raised_everywhere(lambda: problem_of(scene, energy), ValueError, "ufl.derivative(energy, u, v)")
 
 
-def test_increments_of_what():
-    """Of a contact; of a number, which is not taken for the start."""
+def test_wrong_arguments_of_increments_are_refused():
+    """A contact is refused as problem, and a number as load: it is not taken for the start."""
     scene = pressed()
     contact = scene.contact(coulomb())
     raised_everywhere(lambda: fc.increments(contact, scene.E), ValueError, "problem is a Contact")
@@ -97,19 +97,19 @@ def test_increments_of_what():
     raised_everywhere(lambda: fc.increments(problem, 0, 1), ValueError, "load is a int")
 
 
-def test_a_measure_without_tags():
-    """``ufl.ds(2)`` of no tags is zero for DOLFINx, and so would be the load."""
+def test_measure_without_tags_is_refused():
+    """DOLFINx evaluates ``ufl.ds(2)`` without tags to zero, so that the load would vanish."""
     scene = pressed()
     F = bulk(scene, ufl.ds(scene.mesh), TOP)
     raised_everywhere(lambda: problem_of(scene, F), ValueError, f"ds({TOP})", "subdomain_data=tags")
 
 
 @pytest.mark.parametrize("pairs", [False, True])
-def test_a_tag_of_nothing(pairs):
-    """In the bulk form; tags as they are, and as pairs of a number and entities."""
+def test_tag_without_facets_in_a_measure_warns(pairs):
+    """The bulk form has mesh tags, or pairs of a number and entities, as subdomain data."""
     scene = pressed()
     data = scene.tags
-    if pairs:  # what stands there does not matter here, nothing is compiled
+    if pairs:  # the entities are arbitrary: nothing is compiled
         data = [(TOP, np.zeros(2 * len(scene.tags.find(TOP)), dtype=np.int32))]
     ds = ufl.Measure("ds", scene.mesh, subdomain_data=data)
     with warnings.catch_warnings():
@@ -119,16 +119,16 @@ def test_a_tag_of_nothing(pairs):
         check_measures(bulk(scene, ds, MAX_COORDINATE), scene.mesh)
 
 
-def test_a_problem_with_a_tag_of_nothing():
-    """It is told when the problem is made."""
+def test_problem_with_a_tag_without_facets_warns():
+    """The warning for a tag without facets is issued when the problem is created."""
     scene = pressed()
     ds = ufl.Measure("ds", scene.mesh, subdomain_data=scene.tags)
     with pytest.warns(UserWarning, match=rf"over ds\({MAX_COORDINATE}\), but nothing"):
         problem_of(scene, bulk(scene, ds, MAX_COORDINATE))
 
 
-def test_a_condition_on_nothing():
-    """A tag that no facet has, with those that hold: it is told which."""
+def test_condition_without_dofs_warns():
+    """The warning states which Dirichlet condition has no effect, next to others that have."""
     scene = pressed()
     V = scene.u.function_space
     dofs = fem.locate_dofs_topological(V, 1, scene.tags.find(MAX_COORDINATE))
@@ -138,8 +138,8 @@ def test_a_condition_on_nothing():
         problem_of(scene, bcs=bcs)
 
 
-def test_tags_of_another_mesh():
-    """Numbers of facets mean others there, even if the meshes are made alike."""
+def test_tags_of_another_mesh_are_refused():
+    """Facet numbers of another mesh are refused, even if the meshes are created alike."""
     scene = pressed()
     mesh, other = block_mesh("quadrilateral", **MESH)
     fc.ContactSurface(mesh, other, BOTTOM)
@@ -154,7 +154,7 @@ def test_tags_of_another_mesh():
 
 
 def told_of_doubles(make):
-    """What is warned of obstacles that are one."""
+    """Return the warnings that contacts have the same obstacle."""
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         make()
@@ -162,7 +162,7 @@ def told_of_doubles(make):
 
 
 def doubled(scene, obstacle, **options):
-    """A contact of the bottom beside that with the floor, and what is warned of."""
+    """Return the same-obstacle warnings for a second contact of the bottom besides the floor."""
     contacts = [
         scene.contact(coulomb(), name="floor"),
         scene.contact(coulomb(), name="other", obstacle=obstacle, **options),
@@ -172,8 +172,8 @@ def doubled(scene, obstacle, **options):
     )
 
 
-def test_one_obstacle_twice():
-    """Each would bear half of the force: warned of once, with names and facets, two of them."""
+def test_two_contacts_with_the_same_obstacle_warn():
+    """Each contact would carry half of the force: one warning has both names and the two facets."""
     scene = pressed()
     plane = fc.HalfSpace(point=(0.3, 0.0), normal=(0.0, 2.0))
     for obstacle in (scene.floor(), plane):
@@ -181,8 +181,8 @@ def test_one_obstacle_twice():
         assert told.startswith("floor and other have the same obstacle at 2 facets")
 
 
-def test_two_obstacles_of_one_surface():
-    """Another place, another way to move, a gap of its own: none of them is the floor."""
+def test_different_obstacles_of_one_surface_do_not_warn():
+    """An obstacle with another point, normal, displacement or gap than the floor is different."""
     scene = pressed()
     moved = fem.Constant(scene.mesh, np.zeros(2))
     assert not doubled(scene, fc.HalfSpace(point=(0.0, -0.1), normal=(0.0, 1.0)))
@@ -193,8 +193,8 @@ def test_two_obstacles_of_one_surface():
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_two_bodies_over_one_surface(kinematics):
-    """The lowest of three blocks sees both others, one behind the other; then one of them twice."""
+def test_two_contacts_with_the_same_opposing_body_warn(kinematics):
+    """The lowest of three blocks faces both others without a warning, but not one of them twice."""
     body = stack("quadrilateral", (2, 3, 4), (1.0, 1.0, 1.0), apart=0.1)
     body.hold(SIDES, 0, 1)
     for tags, n_told in (((10 + UPPER, 20 + UPPER), 0), ((10 + UPPER, 10 + UPPER), 1)):
@@ -206,8 +206,8 @@ def test_two_bodies_over_one_surface(kinematics):
 
 
 @pytest.mark.parametrize("force", [(None, 1.0), np.array([None, 1.0])])
-def test_two_obstacles_each_pressed_by_a_force(force):
-    """Each moves by its own force and bears all of that: not one obstacle, however it is given."""
+def test_obstacles_with_prescribed_forces_do_not_warn(force):
+    """Each obstacle moves by its own force and carries all of it, given as tuple or array."""
     scene = pressed()
     contacts = [
         scene.contact(coulomb(), name=name, displacement=fc.Motion(force=force))
@@ -219,8 +219,8 @@ def test_two_obstacles_each_pressed_by_a_force(force):
         fc.ContactProblem(scene.F, scene.u, bcs=bcs, contacts=contacts)
 
 
-def test_a_load_that_nothing_reads():
-    """A constant whose value, not itself, stands in the form."""
+def test_load_without_effect_warns():
+    """A constant causes a warning if it does not occur in the problem, whatever its value."""
     scene = pressed()
     problem = problem_of(scene)
     with pytest.warns(UserWarning, match="neither F, nor a Dirichlet condition, nor a contact"):
@@ -229,8 +229,8 @@ def test_a_load_that_nothing_reads():
 
 @pytest.mark.whole
 @pytest.mark.parametrize("where", ["form", "condition", "obstacle", "force", "friction", "gap"])
-def test_a_load_that_something_reads(where):
-    """No warning, wherever it stands, and its value is as before."""
+def test_load_is_found_wherever_it_occurs(where):
+    """`depends_on` finds a load in any part of the problem and leaves its value unchanged."""
     scene = pressed()
     load = fem.Constant(scene.mesh, 0.25)
     bcs, F, law, options = scene.rollers(), scene.F, coulomb(), {}
@@ -257,8 +257,8 @@ def test_a_load_that_something_reads(where):
     assert load.value == 0.25
 
 
-def test_components_in_a_tuple():
-    """A constant among numbers: it is said how to write it."""
+def test_constant_in_a_tuple_is_refused():
+    """The error for a constant among numbers states how to write the vector."""
     scene = pressed()
     way = fem.Constant(scene.mesh, 0.0)
     obstacle = fc.HalfSpace((0, 0), (0, 1), displacement=(way, 0.0))
@@ -269,8 +269,8 @@ def test_components_in_a_tuple():
     )
 
 
-def test_a_solution_that_is_not_committed():
-    """A loop without ``commit``: told once; not after ``restore``, and not where nothing rubs."""
+def test_uncommitted_solution_warns_once():
+    """A loop without ``commit`` warns once, but not after ``restore`` or without friction."""
     scene = pressed()
     problem = problem_of(scene)
     problem.solve()
@@ -291,8 +291,8 @@ def test_a_solution_that_is_not_committed():
         other.solve()
 
 
-def test_a_history_that_jumps():
-    """Led to 1, and then from 0 anew: the way back is not solved for. From where it is: silent."""
+def test_jump_of_the_load_warns():
+    """A load path that starts again warns of the jump; one from the present load does not."""
     scene = pressed()
     problem = problem_of(scene)
     pull = scene.E  # any constant of the form
@@ -305,8 +305,8 @@ def test_a_history_that_jumps():
         list(fc.increments(problem, pull, 1.5 * value, value))
 
 
-def test_folders_that_are_not_there(tmp_path: Path):
-    """Of a picture: the folder is named, not a temporary file in it."""
+def test_missing_folder_of_a_picture_is_named(tmp_path: Path):
+    """The error names the missing folder, not a temporary file in it."""
     scene = pressed()
     contact = scene.contact(coulomb())
     path = Path(COMM.bcast(str(tmp_path))) / "nowhere" / "pressure.png"
@@ -315,8 +315,8 @@ def test_folders_that_are_not_there(tmp_path: Path):
     )
 
 
-def test_a_checkpoint_where_nothing_can_be_written():
-    """Before any work; /proc is such a folder, for root, too."""
+def test_checkpoint_in_a_read_only_folder_is_refused():
+    """The call is refused before any work; /proc is not writable, even for root."""
     scene = pressed()
     problem = problem_of(scene)
     raised_everywhere(

@@ -29,7 +29,7 @@ from scenes.rubber import MIXED, TIGHT, Tool, disc, rubber, split
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(300)]
 
-# Nearly as stiff against volume as against shape, then none, then linear at small strains.
+# Nearly incompressible, incompressible, then linear at small strains.
 HOW = {
     "Taylor-Hood": {"mixed": "Taylor-Hood", "nu": 0.4999},
     "MINI": {"mixed": "MINI", "nu": 0.5},
@@ -46,7 +46,7 @@ HOW = {
 
 
 def tool(how: str, cell: str = "triangle", **options) -> Tool:
-    """A block of few cells under a disc that presses, drags and turns."""
+    """Return a coarse block under a disc that presses, drags and rotates."""
     n = {"n": (8, 4)} if cell == "triangle" else {"n": (3, 2)}
     return Tool(cell, **n, **HOW[how], **options)
 
@@ -56,10 +56,10 @@ def tool(how: str, cell: str = "triangle", **options) -> Tool:
 
 @pytest.mark.each
 @pytest.mark.parametrize("how", HOW)
-def test_history(how):
-    """Down, along, back and turned: all verdicts pass, which compare forces by a cross-check.
+def test_history_is_verified_and_balances(how):
+    """All verdicts of a tool pressed, dragged, moved back and rotated pass, with cross-checks.
 
-    The reactions of the bottom, by assembly here, balance the contact force: 1e-10.
+    The reactions of the bottom, assembled here, balance the contact force to 1e-10.
     """
     solver = {"cross_check": True} | HOW[how].get("solver", {})
     made = Tool("triangle", n=(8, 4), **{**HOW[how], "solver": {"petsc_options": TIGHT, **solver}})
@@ -81,14 +81,14 @@ def test_history(how):
 
 @pytest.mark.each
 @pytest.mark.parametrize("how", ["Taylor-Hood", "MINI", "by force", "augmented", "linear"])
-def test_going_on_from_a_file(how, tmp_path):
-    """Broken off while the tool turns, and taken up: the same digits on one rank, 1e-7 on more."""
+def test_restart_from_a_checkpoint(how, tmp_path):
+    """A history restarted while the tool rotates is the same, bitwise on one rank, 1e-7 on more."""
     goes_on(lambda: tool(how), shared_folder(tmp_path), stop=5)
 
 
 @pytest.mark.parametrize("how", ["Taylor-Hood", "linear"])
-def test_lbfgs_finds_the_same(how):
-    """H₀ is the factored saddle point: no minimum is needed. The same tractions, to 1e-7."""
+def test_lbfgs_agrees_with_newton(how):
+    """L-BFGS with the factored saddle point as H₀ needs no minimum: tractions of Newton, 1e-7."""
     found = []
     for method in ("newton", "lbfgs"):
         solver = HOW[how].get("solver", {}) | {"method": method, "fallback": False}
@@ -100,8 +100,8 @@ def test_lbfgs_finds_the_same(how):
     assert close(found[1], found[0], 1e-7)
 
 
-def test_in_space():
-    """Tetrahedra, pressed and dragged with friction by an isochoric body: verdicts pass."""
+def test_tetrahedra_are_verified():
+    """Verdicts pass for incompressible tetrahedra pressed and dragged with friction."""
     for how in ("Taylor-Hood", "MINI"):
         made = tool(how, "tetrahedron")
         for step in made.increments(1.5):
@@ -109,10 +109,10 @@ def test_in_space():
         assert made.resultant()[-1] < -1.0
 
 
-def test_first_touch_in_increments_that_are_cut():
-    """A disc far away comes down in one increment: cut until it is followed, as 10 find it: 1e-7.
+def test_first_touch_with_cut_increments():
+    """A distant disc is lowered in one increment, cut if needed: tractions of 10 increments, 1e-7.
 
-    Without friction there is one answer.
+    Without friction the solution is unique.
     """
     ends = []
     for steps in (1, 10):
@@ -128,11 +128,11 @@ def test_first_touch_in_increments_that_are_cut():
     assert close(ends[0], ends[1], 1e-7)
 
 
-def test_the_form_in_blocks_of_ones_own():
-    """Displacement and pressure as two functions, in blocks of DOLFINx: the mixed one's tractions.
+def test_contact_form_in_a_user_written_block_newton_method():
+    """Displacement and pressure as two functions, in blocks: tractions of the mixed one, 1e-9.
 
-    A disc presses a block with ν = 1/2 and drags it, in two increments; to 1e-9. What is solved by
-    Newton's method is F + contact.form(v), by functions of two spaces.
+    A disc presses a block with ν = 1/2 and drags it, in two increments. Newton's method solves
+    F + contact.form(v) for functions of two spaces.
     """
     one = tool("isochoric", law=fc.Coulomb(0.3, 1e3, 1e3))
     mesh, tags, d = one.scene.mesh, one.scene.tags, one.scene.dim
@@ -192,10 +192,10 @@ def test_the_form_in_blocks_of_ones_own():
 
 @pytest.mark.parametrize("name", MIXED)
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_tangent_and_boundary_form(name, kinematics):
-    """Over the mixed unknowns: tangent by differences, 1e-6; form and tangent by DOLFINx, 1e-11.
+def test_tangent_and_boundary_form_of_mixed_functions(name, kinematics):
+    """With mixed dofs: tangent by differences, 1e-6; form and tangent by DOLFINx, 1e-11.
 
-    In a state with points that stick, slip and are open.
+    Points of the state stick, slip and are open.
     """
     scene = rubber("triangle", n=(8, 4), mixed=name, nu=0.5)
     W, comm = scene.u.function_space, scene.mesh.comm
@@ -233,8 +233,8 @@ def test_tangent_and_boundary_form(name, kinematics):
 
 
 @pytest.mark.parametrize("how", ["Taylor-Hood", "linear"])
-def test_units(how):
-    """The same block in mm and MPa and in m and GPa: the same iterations, tractions to 1e-9."""
+def test_units_do_not_matter(how):
+    """A block in mm and MPa, and in m and GPa, has the same iterations, and tractions to 1e-9."""
     found = []
     for length, stress in ((1.0, 1.0), (1e-3, 1e-3)):
         scene = rubber(
@@ -260,8 +260,8 @@ def test_units(how):
     assert close(found[1][1], found[0][1], 1e-9)
 
 
-def test_cells_turned_inside_out_by_bubbles_are_seen():
-    """det(I + grad u) takes the bubbles in: they alone make it negative, or pass if smaller."""
+def test_cells_inverted_by_bubbles_are_detected():
+    """The check of det(I + grad u) includes bubbles: they alone invert cells if large enough."""
     scene = rubber("triangle", n=(4, 2), mixed="MINI", nu=0.5)
     problem, _ = scene.problem(disc(scene, 0.8), fc.Frictionless(1e4))
     _, bubbles = compat.collapsed(scene.u.function_space.sub(1))
@@ -271,10 +271,10 @@ def test_cells_turned_inside_out_by_bubbles_are_seen():
         assert problem.full.bulk.is_inverted() is inverted
 
 
-def test_pressures_have_a_unit_by_which_their_equations_are_forces():
-    """Of a stress E/h: it is 1 for displacements and bubbles, to a factor of two and a half.
+def test_unit_of_pressure_dofs_scales_their_equations_to_forces():
+    """The unit of pressures is E/h, of displacements and bubbles 1, each to a factor of 2.5.
 
-    Residuals of the pressure's equations, times it, are what the residual of the problem has.
+    The residual of the problem is the assembled one times these units, to 1e-12 E.
     """
     E = 1e3
     for name in MIXED:
@@ -292,8 +292,8 @@ def test_pressures_have_a_unit_by_which_their_equations_are_forces():
         assert np.abs(problem.full.bulk.assemble_residual() - expected).max(initial=0.0) < 1e-12 * E
 
 
-def test_pressures_that_change_displace_no_body():
-    """Bodies are compared by their displacements, in the unit of which these are."""
+def test_pressure_changes_are_not_displacements_of_bodies():
+    """The displacement of a body does not include its pressure dofs."""
     scene = rubber("triangle", n=(4, 2), mixed="Taylor-Hood", nu=0.5)
     problem, _ = scene.problem(disc(scene, 0.8), fc.Frictionless(1e4))
     full, ((_, pressures),) = problem.full, problem.displacement.others
@@ -302,8 +302,8 @@ def test_pressures_that_change_displace_no_body():
         assert full.scales.largest(full.state()).tolist() == [expected]
 
 
-def test_the_stiffness_of_springs_follows_the_shear_modulus():
-    """E of a mixed form is 3 G, that of an incompressible body, whatever ν: 1e-9."""
+def test_contact_stiffness_follows_the_shear_modulus():
+    """E of a mixed form is 3 G, that of an incompressible body, for every ν, to 1e-9."""
     for nu in (0.3, 0.5):
         scene = rubber("triangle", n=(4, 2), mixed="Taylor-Hood", nu=nu, E=1e3)
         problem, contact = scene.problem(disc(scene, 0.8), fc.Frictionless())
@@ -312,8 +312,8 @@ def test_the_stiffness_of_springs_follows_the_shear_modulus():
         assert close(k_n, np.full_like(k_n, 10 * 3 * 1e3 / (2 * (1 + nu)) / h), 1e-9)
 
 
-def test_a_problem_without_contacts_finds_its_displacement():
-    """The one part that can be: the block squeezed keeps its volume where ν is 1/2, to 1e-6."""
+def test_problem_without_contacts_finds_its_displacement_field():
+    """The only vector part is the displacement: a block with ν = 1/2 keeps its volume, to 1e-6."""
     scene = rubber("triangle", n=(6, 3), mixed="Taylor-Hood", nu=0.5)
     W = scene.u.function_space
     top = fem.Function(W.sub(0).collapse()[0])

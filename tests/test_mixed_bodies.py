@@ -1,4 +1,4 @@
-"""Two bodies with a pressure of their own beside the displacement, pressed together and dragged."""
+"""Contact of two bodies with a mixed displacement-pressure formulation."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ G = E / 3  # ν = 1/2
 
 
 class Blocks:
-    """A block of incompressible rubber on another, 1 by 1/2 each, in plane strain."""
+    """Two blocks of incompressible rubber in plane strain, 1 by 1/2 each, one on the other."""
 
     def __init__(
         self,
@@ -42,19 +42,19 @@ class Blocks:
         contact: dict[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        """Make it. Collective.
+        """Create meshes, forms and problem. Collective.
 
         Args:
             kinematics: "finite" with a neo-Hookean bulk, or "small" with a linear one.
-            law: Between the blocks.
-            mixed: Elements, of `MIXED`.
-            smooth: Whether bottom and top slide on planes, and the left sides, too; else they are
-                held and the top moves along.
-            n: Cells of the lower and the upper block along their sides.
-            widths: Of both.
-            shift: Of the upper one along the lower.
-            contact: Further arguments of the contact.
-            **options: Of the problem.
+            law: Contact law between the blocks.
+            mixed: Name of the elements, one of `MIXED`.
+            smooth: Whether bottom, top and left sides slide on planes; otherwise bottom and top
+                are prescribed in both directions, and the top moves sideways.
+            n: Numbers of cells along the sides of the lower and the upper block.
+            widths: Widths of the lower and the upper block.
+            shift: Initial sideways position of the upper block.
+            contact: Further arguments of the `Contact`.
+            **options: Arguments of the `ContactProblem`.
         """
         mesh, tags = two_blocks("triangle", n, widths, shift)
         self.mesh, W = mesh, mixed_space(mesh, mixed)
@@ -89,19 +89,19 @@ class Blocks:
             **(contact or {}),
         )
         options = {"petsc_options": TIGHT} | options
-        if kinematics == "small":  # of any size, to compare with closed forms
+        if kinematics == "small":  # for comparison with closed forms
             options["small_displacement_tolerance"] = np.inf
         self.problem = fc.ContactProblem(
             self.F, self.w, bcs=bcs, contacts=[self.contact], **options
         )
 
     def load(self, t: float) -> None:
-        """Down in the first half, then along."""
+        """Move the top down in the first half, then sideways."""
         self.down.value = -0.06 * min(1.0, 2 * t)
         self.along.value = 0.2 * max(0.0, 2 * t - 1)
 
     def reaction(self, height: float) -> np.ndarray:
-        """Of the nodes at a height, by assembly here, (2,). Collective."""
+        """Assemble the reaction of the nodes at a height, (2,). Collective."""
         forces = assemble_owned(self.form, self.w.function_space)
         part = self.problem.displacement
         found = np.zeros(2)
@@ -117,14 +117,14 @@ class Blocks:
 @pytest.mark.parametrize("mixed", MIXED)
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 def test_uniform_compression(kinematics, mixed, enforcement):
-    """Between smooth planes, free on the right: the nominal stress G (λ - λ⁻³), or 4 G ε: 1e-6.
+    """Between frictionless planes the nominal stress is G (λ - λ⁻³), or linear 4 G ε, to 1e-6.
 
-    In plane strain at ν = 1/2. Both blocks widen as much, so that nothing slips. By penalty the
-    joint gives way by p/k_n; multipliers leave 1e-9 of that.
+    Plane strain with ν = 1/2, free on the right. Both blocks widen equally, so that no point slips.
+    The penalty adds a penetration p/k_n; multipliers leave 1e-9 of that.
     """
     down, k_n = 0.2 if kinematics == "finite" else 0.01, 1e6
     nominal = 0.0
-    for _ in range(30):  # until the joint is as deep as it is pressed
+    for _ in range(30):  # fixed-point iteration for the penetration
         stretch = 1 - down - (nominal / k_n if enforcement == "penalty" else 0.0)
         nominal = 4 * G * (stretch - 1) if kinematics == "small" else G * (stretch - stretch**-3)
     options = {"enforcement": enforcement}
@@ -149,10 +149,11 @@ def test_uniform_compression(kinematics, mixed, enforcement):
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_dragged_along(kinematics, enforcement):
-    """A narrow block pressed on a wide one and dragged: it slips in the end, by μ of its force.
+def test_dragged_block_slips_at_the_friction_bound(kinematics, enforcement):
+    """A narrow block is pressed on a wide one and dragged until it slips with the force μ N.
 
-    Reactions of the bottom and the top, by assembly here, balance the contact force: 1e-9.
+    That, and the balance of the contact force and the assembled reactions of bottom and top, holds
+    to 1e-9.
     """
     made = Blocks(
         kinematics,
@@ -174,8 +175,8 @@ def test_dragged_along(kinematics, enforcement):
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_a_history_goes_on(kinematics, tmp_path):
-    """Broken off while it is dragged, and taken up: the same to 1e-9 in force and displacement."""
+def test_restarted_history_gives_the_same_solution(kinematics, tmp_path):
+    """A restart while the block is dragged gives the same force and displacement to 1e-9."""
 
     def make() -> Blocks:
         wide = {"n": (8, 4), "widths": (2.0, 1.0), "shift": 0.25}

@@ -1,4 +1,4 @@
-"""Obstacles that move as the force on them says: their translation is unknown, the force given."""
+"""Free obstacles: the force on them is given, their translation is unknown."""
 
 import dolfinx
 import numpy as np
@@ -28,10 +28,11 @@ def pressed(cell, law, motion, method="lbfgs"):
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_given_force_and_given_displacement_are_two_ways_to_one_state(cell, method):
-    """Press by a force, drag by a displacement; then prescribe the motion that was found.
+def test_given_force_and_given_displacement_have_the_same_state(cell, method):
+    """Press by a force, drag by a displacement; then prescribe the resulting motion.
 
-    The contact's force is the given one to the solver's tolerance (1e-9), the states agree to 1e-7.
+    The contact force is the given one to 1e-8 (the solver's tolerance is 1e-9), the states agree to
+    1e-7.
     """
     d = 2 if cell == "triangle" else 3
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
@@ -54,8 +55,8 @@ def test_given_force_and_given_displacement_are_two_ways_to_one_state(cell, meth
     assert close(nodal(other.u), nodal(scene.u), 1e-7)
 
 
-def test_newton_converges_quadratically_with_a_turning_normal():
-    """The tangent has the derivative of the normal of a ball with respect to its motion."""
+def test_newton_converges_quadratically_with_a_rotating_normal():
+    """The tangent includes the derivative of a ball's normal with respect to its motion."""
     motion = fc.Motion(force=(0.5, 5.0))
     _, problem, contact = pressed(
         "quadrilateral", fc.Coulomb(1.0, k_n=2e4, k_t=1e4), motion, "newton"
@@ -69,8 +70,8 @@ def test_newton_converges_quadratically_with_a_turning_normal():
     assert close(contact.resultants().force, [0.6, 5.0], 1e-8)
 
 
-def test_two_forces_and_their_history():
-    """Force up, then sideways below and above what friction bears: the latter has no balance."""
+def test_tangential_force_below_and_above_the_friction_limit():
+    """A vertical force, then a tangential one: above the friction limit the solve fails."""
     scene = block("quadrilateral", 1, n=4)
     pull = fem.Constant(scene.mesh, 0.0)
     motion = fc.Motion(force=(pull, 5.0))
@@ -90,8 +91,8 @@ def test_two_forces_and_their_history():
     assert np.array_equal(problem.full.state(), before)
 
 
-def test_a_block_between_the_floor_and_a_weight():
-    """A free body on a floor, pressed by a free obstacle: p = P everywhere, whatever E is."""
+def test_block_between_floor_and_loaded_obstacle():
+    """A free body on a floor, pressed by a free obstacle with force P: p = P everywhere, 1e-8."""
     scene = block("triangle", 1, n=3, nu=0.0)
     floor = scene.contact(fc.Frictionless(k_n=1e4), name="floor")
     lid = fc.ContactSurface(scene.mesh, scene.tags, TOP)
@@ -105,8 +106,8 @@ def test_a_block_between_the_floor_and_a_weight():
     assert close(top.free_motion[1].value, -7.0 * (2 / 1e4 + 1 / 1000), 1e-8)
 
 
-def test_an_obstacle_on_its_way_meets_the_body():
-    """An obstacle far away is led to first touch by its force."""
+def test_distant_loaded_obstacle_reaches_the_body():
+    """A distant obstacle is moved to first touch by its force; force and motion to 1e-8."""
     scene = block("quadrilateral", 1, n=4, nu=0.0)
     away = fc.HalfSpace((0, -30.0), (0, 1), displacement=fc.Motion(force=(None, 4.0)))
     bcs = [scene.hold(TOP, i) for i in range(2)]
@@ -124,8 +125,8 @@ def test_an_obstacle_on_its_way_meets_the_body():
         (fc.Motion(force=(1.0, 0.0, 0.0)), "2 of each"),
     ],
 )
-def test_wrong_motions(motion, word):
-    """A component with both, or a wrong number of them, is refused."""
+def test_wrong_motions_are_refused(motion, word):
+    """Components with both force and displacement, or a wrong number of them, raise an error."""
     scene = block("triangle", 1)
     raised_everywhere(
         lambda: scene.contact(fc.Frictionless(), displacement=motion), ValueError, word
@@ -133,10 +134,10 @@ def test_wrong_motions(motion, word):
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_one_motion_of_two_contacts_is_refused(turned):
-    """Each contact has unknowns of its own: one tool on two of them would bear its load twice.
+def test_free_motion_of_two_contacts_is_refused(turned):
+    """Each contact has its own unknowns: the load on an obstacle of two contacts would act twice.
 
-    On both surfaces in one contact it bears it once, to the solver's tolerance (1e-9).
+    In one contact with both surfaces it acts once, to 1e-8 (the solver's tolerance is 1e-9).
     """
     scene = block("triangle", 1)
     motion = fc.Motion(force=(None, -5.0))
@@ -170,8 +171,8 @@ def test_one_motion_of_two_contacts_is_refused(turned):
     assert close(step.contacts["on [1, 2]"].force[1], -5.0, 1e-8)
 
 
-def test_the_form_alone_refuses_an_unknown_motion():
-    """The boundary form by itself has no place for the obstacle's unknowns."""
+def test_boundary_form_refuses_an_unknown_motion():
+    """The boundary form without a problem has no unknowns for the obstacle's motion: an error."""
     scene = block("triangle", 1)
     contact = scene.contact(fc.Frictionless(k_n=1.0), displacement=fc.Motion(force=(None, 1.0)))
     raised_everywhere(

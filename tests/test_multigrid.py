@@ -1,4 +1,4 @@
-"""Multigrid for the systems over all unknowns: the same solutions as by factorisation."""
+"""Multigrid for the systems of all dofs: its solutions are those of factorisation."""
 
 import logging
 
@@ -27,20 +27,23 @@ from scenes.two_blocks import TOP as LID
 pytestmark = [pytest.mark.three_ranks, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
 
-# Residuals of 1e-12 of the forces, so that what is left is rounding times the condition, 1e4.
+# Residuals of 1e-12 of the forces: solutions differ by round-off times the condition, 1e4.
 TIGHT = {"snes_rtol": 1e-12}
 SAME = 1e-8
 
 
 def both(make):
-    """What ``make(**options)`` gives by multigrid and by factorisation of all unknowns."""
+    """Return the results of ``make(**options)`` by factorisation and by multigrid, for all dofs."""
     return [
         make(linear_solver=kind, condensation=False, petsc_options=TIGHT) for kind in linear.KINDS
     ]
 
 
 def assert_same_path(cell, degree, method, n, path):
-    """A block to and fro on a round cushion with friction, its top prescribed: fields to 1e-8."""
+    """Check that the fields by multigrid and by factorisation agree to 1e-8.
+
+    A block, its top prescribed, is moved back and forth on a round cushion with friction.
+    """
 
     def make(**options):
         made = Rub(cell=cell, degree=degree, mesh={"n": n}, method=method, **options)
@@ -59,22 +62,22 @@ def assert_same_path(cell, degree, method, n, path):
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize(("cell", "degree"), [case for case in GRID if case != ("hexahedron", 2)])
-def test_same_path(cell, degree, method):
-    """On all cells; with prescribed values, which a V-cycle must not move."""
+def test_multigrid_equals_factorisation(cell, degree, method):
+    """Solutions agree for all cells, with Dirichlet values, which a V-cycle must not change."""
     n = (16 if cell in ("triangle", "quadrilateral") else 8) // degree
     assert_same_path(cell, degree, method, n, PATH[:3])
 
 
 @pytest.mark.parametrize(("cell", "n"), [("triangle", 8), ("hexahedron", 4)])
-def test_same_path_by_alternation(cell, n):
-    """It has linear solvers of its own."""
+def test_multigrid_in_the_tresca_fixed_point(cell, n):
+    """Solutions agree for the Tresca fixed point, which has linear solvers of its own."""
     assert_same_path(cell, 1, "alternating", n, PATH[2:3])
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_nothing_but_contact_holds_the_body(cell, method):
-    """A block that stands on a floor with friction, pressed and pushed: K itself is singular."""
+def test_body_constrained_by_contact_alone(cell, method):
+    """Solutions agree for a block pressed and pushed on a floor with friction: K is singular."""
 
     def make(**options):
         scene = block(cell, n=16 if cell == "triangle" else 6, side=0.2, up=-1.0)
@@ -89,8 +92,8 @@ def test_nothing_but_contact_holds_the_body(cell, method):
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
-def test_nothing_in_contact(method):
-    """A block without any contact: levels have nothing to follow."""
+def test_problem_without_contact(method):
+    """Solutions agree for a block without any contact, whose levels need no updates."""
 
     def make(**options):
         scene = block("triangle", n=16, up=-1.0)
@@ -105,11 +108,11 @@ def test_nothing_in_contact(method):
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_two_bodies(cell, method):
-    """A block on a block with friction, meshes that do not match, the upper one held by nothing."""
+    """Solutions agree for an unconstrained block on a block with friction and another mesh."""
 
     def make(**options):
         n = (12, 9) if cell == "quadrilateral" else (6, 5)
-        mesh, tags = two_blocks(cell, n, widths=(1.0, 0.71), shift=0.1)  # no two nodes in one place
+        mesh, tags = two_blocks(cell, n, widths=(1.0, 0.71), shift=0.1)  # no coincident nodes
         d = mesh.geometry.dim
         space = fem.functionspace(mesh, ("Lagrange", 1, (d,)))
         u, v = fem.Function(space), ufl.TestFunction(space)
@@ -131,10 +134,11 @@ def test_two_bodies(cell, method):
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_units(method):
-    """The same iterations and digits in other units, 1e-9 of the field.
+    """Iterations and digits are the same in other units, to 1e-9 of the field.
 
-    On several ranks the iterations to a tenth. The cells are distributed by hand: left to itself
-    the partitioner distributes equal meshes differently, and the smoother is that of each rank.
+    On several ranks the iterations agree to a tenth. The cells are distributed explicitly: the
+    partitioner may distribute equal meshes differently, and the smoother depends on the cells of
+    each rank.
     """
     found = []
     for length, pressure in [(1.0, 1.0), (1e-3, 1e6), (1e-9, 1e9)]:
@@ -155,7 +159,7 @@ def test_units(method):
 
 
 def krylov_iterations(n: int, *, rotations: bool) -> int:
-    """Of conjugate gradients for a slender beam, clamped at one end, n cells across."""
+    """Return the conjugate gradient iterations for a slender cantilever with n cells across."""
     scene = block("hexahedron", n=(10 * n, n, n), size=(10.0, 1.0, 1.0))
     bcs = [scene.hold(LEFT, i) for i in range(3)]
     problem, _ = scene.problem(fc.Frictionless(), bcs, method="newton", linear_solver="multigrid")
@@ -172,25 +176,26 @@ def krylov_iterations(n: int, *, rotations: bool) -> int:
 
 
 def test_iterations_hardly_grow_with_the_mesh():
-    """The rotations on the levels of multigrid are what keeps the iterations where they are.
+    """Rotations in the near null space of the levels keep the iterations nearly constant.
 
-    Theory of smoothed aggregation: they do not depend on the mesh; without the rotations they do.
+    Theory of smoothed aggregation: with them iterations do not depend on the mesh; without them
+    they do.
     """
     coarse, fine = (krylov_iterations(n, rotations=True) for n in (2, 4))
     assert fine <= 1.5 * coarse
     assert krylov_iterations(4, rotations=False) > 1.5 * fine
 
 
-# ---- the choice ----------------------------------------------------------------------------------
+# ---- solver selection ----------------------------------------------------------------------------
 
 
 def said(caplog) -> str:
-    """What was logged, on rank 0."""
+    """Return the log messages of rank 0."""
     return COMM.bcast("\n".join(r.getMessage() for r in caplog.records))
 
 
-def test_wrong_values():
-    """Another name is refused, and so is condensation by multigrid; nothing is left behind."""
+def test_invalid_solver_options_are_refused():
+    """Unknown names and condensation with multigrid are refused; PETSc's options are unchanged."""
     scene = block("triangle", up=-1.0)
     before = PETSc.Options().getAll()
 
@@ -206,8 +211,8 @@ def test_wrong_values():
     assert PETSc.Options().getAll() == before
 
 
-def test_chosen_where_factors_do_not_fit(caplog, monkeypatch):
-    """By memory: no condensation and no factor of more than half of it; the log says so."""
+def test_multigrid_is_selected_if_memory_is_short(caplog, monkeypatch):
+    """Neither condensation nor factors may need more than half of the memory; this is logged."""
     scene = block("quadrilateral", n=8, up=-1.0)
     with caplog.at_level(logging.INFO, logger="fenics_contact"):
         problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
@@ -222,8 +227,8 @@ def test_chosen_where_factors_do_not_fit(caplog, monkeypatch):
     assert wanted.full.linear_kind == "direct"
 
 
-def test_chosen_where_it_is_quicker():
-    """In three dimensions, for many unknowns; for more if one factorisation serves a history."""
+def test_multigrid_is_selected_if_it_is_faster():
+    """Multigrid is faster in 3D for many dofs, for more of them if one factorisation is reused."""
     assert not linear.is_multigrid_faster(10_000, 3)
     assert linear.is_multigrid_faster(100_000, 3)
     assert linear.is_multigrid_faster(100_000, 3, condensed_for=1)
@@ -235,11 +240,12 @@ def test_chosen_where_it_is_quicker():
 @pytest.mark.mpi
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("degree", [1, 2])
-def test_bodies_count_as_much_as_they_cost_to_factor(turned, degree):
-    """Unknowns of the least cross-section w as cubes of w^(3/2), and of several bodies the mean w².
+def test_cube_size_follows_the_cost_of_factorisation(turned, degree):
+    """A body with w nodes in its least cross-section counts as a cube of w^(3/2) nodes.
 
-    A cross-section has the cells across a box times the nodes per cell of the lattice, exactly.
-    Wherever the bodies are and however they are turned.
+    For several bodies w² is averaged over the nodes. A cross-section has the cells across a box
+    times the nodes per cell of the lattice, exactly, independent of position and rotation of the
+    bodies.
     """
     cells = np.array([[24, 12, 6], [8, 6, 7]])
     lines = [
@@ -260,7 +266,7 @@ def test_bodies_count_as_much_as_they_cost_to_factor(turned, degree):
 
 
 def cube(size):
-    """A cube of gmsh's tetrahedra, of a size by the distance from the middle."""
+    """Return gmsh's tetrahedra of a cube, their size given by the distance from its centre."""
     gmsh.initialize()
     try:
         gmsh.option.setNumber("General.Terminal", 0)
@@ -278,10 +284,11 @@ def cube(size):
 
 @pytest.mark.mpi
 @pytest.mark.parametrize("graded", [False, True])
-def test_small_cells_in_the_middle_count(graded):
-    """The cells that planes through the middle cut, counted one by one, to 15 %: a layer of planes.
+def test_small_cells_in_the_middle_increase_the_cube_size(graded):
+    """The size follows from the cells cut by planes through the middle, to 15 %, a layer of planes.
 
-    By them a cube with small cells in the middle counts as more than its own number of unknowns.
+    Reference: the cut cells counted one by one. A cube with small cells in the middle counts as
+    larger than its own number of dofs.
     """
     mesh = cube((lambda r: 0.04 + 0.2 * r) if graded else (lambda r: 0.1))
     space = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
@@ -295,8 +302,8 @@ def test_small_cells_in_the_middle_count(graded):
     assert (found > 1.5 * 3 * n) == graded
 
 
-def test_chosen_by_the_number_of_increments(monkeypatch):
-    """Multigrid for few increments, condensed for many; settled with the first solution."""
+def test_solver_selection_depends_on_the_number_of_increments(monkeypatch):
+    """Few increments select multigrid, many condensation; the first solution fixes the choice."""
     scene = block("hexahedron", n=2)
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
     monkeypatch.setattr(linear, "_MULTIGRID_SIZE", 0)
@@ -313,15 +320,15 @@ def test_chosen_by_the_number_of_increments(monkeypatch):
     problem.expected_increments = 2
     assert problem.solver.condensed
     assert problem.solve().contacts["contact"].normal_force == pytest.approx(few, rel=1e-8)
-    # `increments` knows the number.
+    # `increments` sets the number.
     for steps, condensed in ((1, False), (3, True)):
         problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
         list(fc.increments(problem, lambda share: None, steps=steps))
         assert problem.solver.condensed == condensed
 
 
-def test_an_obstacle_that_moves_freely(caplog):
-    """Its motions are no nodes: factors, and the log says why."""
+def test_free_obstacle_is_solved_by_factorisation(caplog):
+    """Motions of an obstacle are not nodal dofs: factors are used, and the log says why."""
     scene = block("triangle", n=4)
     motion = fc.Motion(force=(None, 5.0))
     with caplog.at_level(logging.INFO, logger="fenics_contact"):
@@ -337,8 +344,8 @@ def test_an_obstacle_that_moves_freely(caplog):
     assert close(contact.resultants().force[1], 5.0, 1e-8)
 
 
-def test_options_reach_the_levels():
-    """What the caller gives for solvers inside of solvers holds, and is not left behind."""
+def test_options_reach_the_multigrid_levels():
+    """Options for nested solvers are applied, and do not remain in PETSc's database."""
     before = PETSc.Options().getAll()
     made = Rub(
         method="lbfgs",
@@ -353,20 +360,20 @@ def test_options_reach_the_levels():
     assert PETSc.Options().getAll() == before
 
 
-# ---- what it takes -------------------------------------------------------------------------------
+# ---- memory, monitors and levels -----------------------------------------------------------------
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="MUMPS on one rank")
 @pytest.mark.parametrize(("cell", "n"), [("hexahedron", 14), ("triangle", 100)])
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_memory_of_factors(cell, n, symmetric):
-    """The estimate against what MUMPS says it took, within a factor of 1.5."""
+    """The estimated memory is within a factor of 1.5 of that reported by MUMPS."""
     scene = block(cell, n=n)
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers(), condensation=False)
     matrix = problem.full.stiffness.copy()
     held = np.flatnonzero(problem.full.constrained).astype(np.int32)
     matrix.zeroRowsColumns(held, diag=problem.full.bulk.scale)
-    matrix.shift(problem.full.bulk.scale * 1e-6)  # nothing holds the height
+    matrix.shift(problem.full.bulk.scale * 1e-6)  # the height is not constrained
     matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
     pc = PETSc.PC().create(COMM)
     pc.setOperators(matrix)
@@ -378,8 +385,8 @@ def test_memory_of_factors(cell, n, symmetric):
     assert taken / 1.5 < estimate < 1.5 * taken
 
 
-def test_monitors_outlive_the_choice_of_the_solver(monkeypatch):
-    """`increments` may make SNES anew: what watches it is called all the same, as it was set."""
+def test_monitors_are_kept_when_the_solver_is_replaced(monkeypatch):
+    """`increments` may create a new SNES: its monitors are called with the same arguments."""
     scene = block("hexahedron", n=2, up=-1.0)
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
     monkeypatch.setattr(linear, "_MULTIGRID_SIZE", 0)
@@ -398,21 +405,21 @@ def test_monitors_outlive_the_choice_of_the_solver(monkeypatch):
     assert problem.snes is not before and not problem.solver.condensed
     for name, unit in (("a name", 2.0), ("count", 1)):
         iterations = [it for it, norm, n, u in seen if (n, u) == (name, unit)]
-        assert len(iterations) > step.iterations > 0  # and where a round begins
+        assert len(iterations) > step.iterations > 0  # and at the start of a solve
 
 
 def levels_of(pc):
-    """Matrices of all levels, the finest first, and the maps from each to the one above."""
+    """Return the matrices of all levels, finest first, and the maps from each to the one above."""
     top = pc.getMGLevels() - 1
     matrices = [pc.getMGSmoother(n).getOperators()[0] for n in range(top, -1, -1)]
     return matrices, [pc.getMGInterpolation(n) for n in range(top, 0, -1)]
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_levels_follow_their_matrix(cell):
-    """After a history every level is PᵀAP of the one above, by products of the whole: 1e-12.
+def test_level_matrices_are_galerkin_products(cell):
+    """After a history every level is PᵀAP of the level above, to 1e-12.
 
-    They were set up once.
+    Reference: products of the whole matrices. The levels are set up once.
     """
     n = 24 if cell == "triangle" else 8
     options = {"linear_solver": "multigrid", "condensation": False, "method": "lbfgs"}
@@ -430,10 +437,11 @@ def test_levels_follow_their_matrix(cell):
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_pairs_that_follow_the_bodies(cell):
-    """Their matrices have another pattern each time, which no levels can follow: all are new.
+def test_finite_sliding_pairs_rebuild_the_levels(cell):
+    """Finite-sliding pairs change the pattern of the matrix: all levels are set up again.
 
-    Two blocks on a floor, pressed and pushed to and fro, L-BFGS; reference: factorisation, tight.
+    Two blocks on a floor are pressed and pushed back and forth, with L-BFGS. Reference:
+    factorisation, with tight tolerances, to 1e-8.
     """
 
     def make(**options):

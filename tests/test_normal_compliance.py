@@ -23,7 +23,7 @@ EXACT = 1e-7
 def test_approach_under_uniform_pressure(cell, m):
     """δ = h (p/p0)^(1/m) at every point, loading and unloading, and W = p δ/(m+1) per area.
 
-    Without Poisson's effect the block does not move along the floor, so that friction is idle.
+    Without Poisson's effect the block has no tangential displacement, and friction is zero.
     """
     scene = block(cell, E=E, nu=0.0)
     problem, contact = scene.problem(fc.NormalCompliance(MU, P0, H, m), scene.rollers())
@@ -42,7 +42,7 @@ def test_approach_under_uniform_pressure(cell, m):
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_sliding(cell):
+def test_friction_bound_of_sliding_points(cell):
     """Dragged until all points slip, and back: |τ| = μ p0 (δ/h)^m at every point, against slip."""
     scene = block(cell, E=E, nu=0.3, n=3)
     d = scene.dim
@@ -64,7 +64,7 @@ def test_sliding(cell):
     assert step.energy.dissipation > 0
 
 
-def test_any_units():
+def test_solution_is_independent_of_units():
     """Approach and iterations are the same in N and mm, in N and µm, and with forces times 1e6."""
     found = []
     for force, length in ((1.0, 1.0), (1e6, 1.0), (1.0, 1e3)):
@@ -77,14 +77,14 @@ def test_any_units():
         assert iterations == found[0][0] and close(delta, found[0][1], EXACT)
 
 
-def test_restart(tmp_path):
-    """On a ball, pressed, dragged and back: resumed from its checkpoint, the history is equal."""
+def test_restarted_history_is_equal(tmp_path):
+    """Pressed on a ball, dragged and back: a history restarted from its checkpoint is equal."""
     law = fc.NormalCompliance(MU, P0, H, k_t=1e3)
     goes_on(lambda: Press(law, cell="triangle"), shared_folder(tmp_path), stop=5, tolerance=1e-6)
 
 
-def test_what_is_refused():
-    """An exponent below 1, parameters that are not positive, and multipliers, with their names."""
+def test_invalid_parameters_are_refused():
+    """Exponents below 1, parameters that are not positive, and multipliers are refused by name."""
     scene = block()
     for m in (0.5, 0.0, -1.0, float("nan")):
         raised_everywhere(lambda m=m: fc.NormalCompliance(MU, P0, H, m), ValueError, "exponent")

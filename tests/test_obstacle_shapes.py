@@ -1,7 +1,7 @@
-"""Where rigid obstacles are drawn: on the surface that they are given by, moved as they are.
+"""Rigid obstacles are drawn at the surface that defines them, displaced as they are.
 
-References: the surfaces' equations. Linear functions on a grid of 1/160 of the box miss a circle by
-h²/8R, less than 1e-4 of the box here; planes they have to round-off.
+References: the surfaces' equations. Linear interpolation on a grid of 1/160 of the box deviates
+from a circle by h²/8R, less than 1e-4 of the box here, and from planes by round-off.
 """
 
 import numpy as np
@@ -30,7 +30,7 @@ def circle(centre, radius):
 
 
 def obstacles(mesh):
-    """By name an obstacle, and the equation of its surface where it has moved to."""
+    """Return, by name, obstacles and the equations of their displaced surfaces."""
     way, angle = fem.Constant(mesh, (0.1, 0.2)), fem.Constant(mesh, 0.0)
     points = np.array([[0.2, 0.2], [0.8, 0.2], [0.5, 0.7]])
     corners = np.array([[0, 1], [1, 2], [2, 0]])
@@ -67,8 +67,8 @@ def obstacles(mesh):
 @pytest.mark.parametrize(
     "name", ["plane", "moved", "hole", "distance", "spline", "polyline", "turned"]
 )
-def test_the_surface_in_the_plane(name):
-    """All that is drawn is on the surface, whose length in the box is known from a finer grid."""
+def test_drawn_surface_in_the_plane(name):
+    """All drawn points are on the surface, whose length in the box is known from a finer grid."""
     scene = block("triangle")
     given = obstacles(scene.mesh)
     obstacle, equation = given[name]
@@ -86,7 +86,7 @@ def test_the_surface_in_the_plane(name):
         assert np.abs(equation(found.reshape(-1, 2))).max() < allowed
         axis = np.linspace(0, 1, 401)
         grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
-        if name != "polyline":  # whose equation here has no sign
+        if name != "polyline":  # its equation here has no sign
             values = equation(grid.reshape(-1, 2)).reshape(grid.shape[:2])
             lengths = [
                 np.linalg.norm(s[:, 1] - s[:, 0], axis=1).sum()
@@ -98,8 +98,8 @@ def test_the_surface_in_the_plane(name):
 
 
 @pytest.mark.parametrize("cell", ["tetrahedron", "hexahedron"])
-def test_the_surface_in_space(cell):
-    """A ball: its part in the box, with its area 2π R h of a cap of the height h, to 1 %."""
+def test_drawn_surface_in_space(cell):
+    """The part of a ball in the box has the area 2π R h of a cap of height h, to 1 %."""
     made = Rub(cell=cell)
 
     def check():
@@ -114,8 +114,8 @@ def test_the_surface_in_space(cell):
     on_first(check)
 
 
-def test_what_has_no_place_is_not_drawn():
-    """A gap that is given on Γc, with and without a function of it."""
+def test_prescribed_gap_is_not_drawn():
+    """A gap prescribed on Γc, by a function or a number, has no known shape."""
     scene = block("triangle")
     for options in (
         {"obstacle": bulge(scene)},
@@ -125,8 +125,8 @@ def test_what_has_no_place_is_not_drawn():
         assert not ObstacleShape.is_known(scene.contact(fc.Frictionless(1e3), **options))
 
 
-def test_magnified_motion_and_former_states():
-    """Displacements of obstacles are drawn so many times as large; frames have their own."""
+def test_magnified_displacement_and_previous_states():
+    """Displacements of obstacles are magnified; frames use the displacements of their own state."""
     scene = block("triangle")
     way = fem.Constant(scene.mesh, (0.0, -0.01))
     contact = scene.contact(fc.Frictionless(1e3), displacement=way)
@@ -142,8 +142,8 @@ def test_magnified_motion_and_former_states():
     on_first(check)
 
 
-def test_pictures_films_and_files(tmp_path, monkeypatch):
-    """A tool goes down on rubber: all of them have it where it is at the time."""
+def test_obstacle_in_pictures_animations_and_files(tmp_path, monkeypatch):
+    """A tool moves down on rubber: all outputs show it at its position at the time."""
     folder = shared_folder(tmp_path)
     made = Tool(law=fc.Frictionless(1e4))
     figures, save = [], drawing.save
@@ -169,14 +169,14 @@ def test_pictures_films_and_files(tmp_path, monkeypatch):
         assert len(series) == 2
         grids = [vtu.read(folder / "files" / name) for _, name in series]
         assert all(grid.kind == 3 and len(grid.x) > 20 for grid in grids)
-        # It went down.
+        # It has moved down.
         assert grids[1].x[..., 1].min() < grids[0].x[..., 1].min() - 1e-3
 
     on_first(check)
 
 
 def is_of(collection, colour):
-    """Whether lines of a collection have a colour."""
+    """Return whether the lines of a collection have a colour."""
     from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgba
 

@@ -1,6 +1,6 @@
-"""What the verdict says of rigid obstacles: no distance, too deep, on the other side.
+"""Verdict on rigid obstacles: invalid distances, large penetration, tunnelling, rotations.
 
-And how they meet what was given late: E, a start, a motion by force beside a turn.
+Also tested: moduli and initial displacements set after creation, driving forces with rotation.
 """
 
 import numpy as np
@@ -24,12 +24,12 @@ pytestmark = pytest.mark.two_ranks
 
 
 def roller(scene, radius, shift, **options):
-    """A cylinder that just touches the middle of the top."""
+    """Return a cylinder that just touches the middle of the top."""
     return fc.Cylinder((0.0, scene.height + radius), radius, displacement=shift, **options)
 
 
 def level_set(scene, radius, *, true, shift):
-    """The same by a function that is zero on it, divided by the length of its gradient if true."""
+    """Return a cylinder as a level set, divided by the length of its gradient if ``true``."""
     top = scene.height + radius
 
     def distance(x):
@@ -41,8 +41,8 @@ def level_set(scene, radius, *, true, shift):
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_what_is_no_distance_is_refused(kinematics):
-    """x² - R² in place of |x| - R has slope 2 R; over twice |x| it is one to p/2R, 1e-3 here."""
+def test_level_set_that_is_no_distance_is_refused(kinematics):
+    """x² - R² has slope 2 R; divided by 2 |x| it is a distance up to d/2R for the depth d, 1e-3."""
     radius, forces = 2.0, []
     for true in (True, False, None):
         scene = rubber(n=(12, 4), linear=True)
@@ -63,14 +63,14 @@ def test_what_is_no_distance_is_refused(kinematics):
 
 
 class Roller(fc.Obstacle):
-    """A cylinder as a user writes it, its gap times a factor, its direction off by an angle."""
+    """A user-defined cylinder, its gap scaled and its direction rotated by an angle."""
 
     def __init__(self, center, radius, displacement, *, factor=1.0, angle=0.0):
         self.center, self.radius, self.displacement = center, radius, displacement
         self.factor, self.angle = factor, angle
 
     def place(self, x, to_ufl):
-        """See `Obstacle`."""
+        """Return gap and direction at x, as `Obstacle` specifies."""
         arm = x - ufl.as_vector(self.center)
         distance = ufl.sqrt(ufl.dot(arm, arm))
         c, s = np.cos(self.angle), np.sin(self.angle)
@@ -82,10 +82,10 @@ class Roller(fc.Obstacle):
 @pytest.mark.parametrize(
     ("wrong", "error"), [({}, None), ({"factor": 2.0}, "1"), ({"angle": 0.1}, r"0\.(1|0999)")]
 )
-def test_an_own_obstacle_must_be_a_distance(kinematics, wrong, error):
-    """Moved while pressed, it bears as `Cylinder` does to 1e-9; a wrong gap or normal is refused.
+def test_user_defined_obstacle_needs_distance_and_unit_normal(kinematics, wrong, error):
+    """A `Roller` has the forces of `Cylinder` to 1e-9; a wrong gap or normal is refused.
 
-    By |1 - factor|, and 2 sin(angle/2).
+    The error is |1 - factor|, or 2 sin(angle/2).
     """
     forces = []
     for own in (True, False):
@@ -112,8 +112,8 @@ def test_an_own_obstacle_must_be_a_distance(kinematics, wrong, error):
 
 
 @pytest.mark.parametrize("data", ["function", "coordinates"])
-def test_a_distance_with_data_on_the_mesh_must_be_one(data):
-    """2 (level - x_1) has a gradient of 2, level a function or an expression of coordinates."""
+def test_gradient_of_distance_with_mesh_data_is_checked(data):
+    """2 (level - x_1) with a function or an expression as level has a gradient of 2."""
     forces = []
     for factor in (1.0, 2.0):
         scene = rubber(n=(4, 2), linear=True)
@@ -153,8 +153,8 @@ def test_a_distance_with_data_on_the_mesh_must_be_one(data):
         (lambda x: fc.Placement(x[1], ufl.as_vector([0.0, 0.0])), "zero"),
     ],
 )
-def test_what_place_returns_is_checked(place, words):
-    """In words that name the class, before anything is compiled."""
+def test_return_value_of_place_is_checked(place, words):
+    """The error names the class, and is raised before compilation."""
     scene = rubber(n=(2, 2), linear=True)
 
     class Own(fc.Obstacle):
@@ -168,7 +168,7 @@ def test_what_place_returns_is_checked(place, words):
 @pytest.mark.parametrize(
     ("distance", "words"),
     [
-        (lambda x: x[2], ["2 components", "out of bounds"]),  # of a mesh in space, in the plane
+        (lambda x: x[2], ["2 components", "out of bounds"]),  # an index for 3D on a mesh in 2D
         (lambda x: np.hypot(*x), ["hypot"]),
         (lambda x: None, ["None"]),
         (lambda x: 0.1, ["does not depend on x"]),
@@ -176,8 +176,8 @@ def test_what_place_returns_is_checked(place, words):
     ],
     ids=["index", "numpy", "none", "number", "constant"],
 )
-def test_a_function_that_is_no_distance_is_named(distance, words, kinematics):
-    """UFL's own words for these, "Index out of bounds" or "Division by zero", name no obstacle."""
+def test_error_names_an_invalid_distance_function(distance, words, kinematics):
+    """The error names the obstacle, unlike UFL's "Index out of bounds", "Division by zero"."""
     scene = block()
     obstacle = fc.SignedDistance(distance)
     raised_everywhere(
@@ -189,8 +189,8 @@ def test_a_function_that_is_no_distance_is_named(distance, words, kinematics):
 
 
 @pytest.mark.parametrize("length", [1e-300, 1e-5, 1e200])
-def test_a_normal_of_any_length(length):
-    """The normal of a plane and the axis of a cylinder: their squares overflow, or are zero."""
+def test_normals_and_axes_of_any_length(length):
+    """Gaps agree to 1e-14 although squares of normals or axes overflow or underflow."""
     scene = block("tetrahedron")
     for made in (
         lambda size: fc.HalfSpace((0, 0, -0.1), (0.0, -0.3 * size, 0.7 * size)),
@@ -203,11 +203,10 @@ def test_a_normal_of_any_length(length):
         assert close(gaps[1], gaps[0], 1e-14, scale=1.0)
 
 
-def test_an_obstacle_that_sinks_in_is_refused():
-    """Soft springs, a small roller: refused before it comes out on its other side.
+def test_penetration_beyond_half_the_radius_is_refused():
+    """A small roller with low k_n is refused before points reach its far side.
 
-    Every increment that passes has more force than the one before, and no point is deeper than
-    half of the radius.
+    In every accepted increment the force increases, and no point is deeper than half of the radius.
     """
     radius, forces = 0.3, []
     scene = rubber(n=(8, 4), E=10.0, nu=0.49)
@@ -226,8 +225,8 @@ def test_an_obstacle_that_sinks_in_is_refused():
     assert np.all(np.diff(forces) > 0)
 
 
-def test_an_obstacle_that_goes_through_in_one_increment_is_refused():
-    """A roller as thick as half of what it goes down by: nothing of Γc touches it there."""
+def test_tunnelling_of_a_roller_in_one_increment_is_refused():
+    """A roller moves down by 1.5 diameters, where no point of Γc touches it."""
     radius = 0.15
     scene = rubber(n=(16, 4), E=10.0)
     shift = fem.Constant(scene.mesh, (0.0, -0.45))
@@ -237,8 +236,7 @@ def test_an_obstacle_that_goes_through_in_one_increment_is_refused():
     gone, x = (
         gathered(COMM, each)[:, 0] for each in (probe.find_crossed(np.zeros(len(probe.x))), probe.x)
     )
-    # It has passed straight down over all halves of facets below its middle half, and over none
-    # aside of it.
+    # It has crossed all probe points below its middle half, and none beyond its radius.
     middle = x[np.abs(x) < 0.5 * radius]
     assert len(middle) and np.isin(middle.round(9), gone.round(9)).all()
     assert np.abs(gone).max() < radius + 1 / 32
@@ -250,16 +248,16 @@ def test_an_obstacle_that_goes_through_in_one_increment_is_refused():
 @pytest.mark.parametrize(
     "distance", [lambda z: ufl.ln(z - 2.0), lambda z: ufl.sqrt(z**2) - 0.1], ids=["gap", "slope"]
 )
-def test_a_distance_that_is_no_number_is_refused(distance):
-    """Its points are neither open nor closed; or they are closed, and have no normal."""
+def test_nan_in_gap_or_normal_is_refused(distance):
+    """A NaN in the gap leaves points neither open nor closed; one in the slope, no normal."""
     scene = rubber(n=(4, 2), E=10.0)
     obstacle = fc.SignedDistance(lambda x: distance(scene.height - x[1]))
     problem, _ = scene.problem(obstacle, fc.Frictionless(1e3))
     raised_everywhere(problem.solve, fc.NotConverged, "is not a number")
 
 
-def test_an_obstacle_that_is_no_number_at_the_end_of_an_increment_is_refused():
-    """A bump that ends, moved aside from under a body that hovers over it: first touch is asked."""
+def test_nan_gap_at_the_end_of_an_increment_is_refused():
+    """A bump of finite extent leaves the body above it, so that the first touch is NaN."""
     scene = rubber(n=(4, 2), E=10.0)
     shift = fem.Constant(scene.mesh, np.zeros(2))
     bump = fc.SignedDistance(
@@ -273,13 +271,13 @@ def test_an_obstacle_that_is_no_number_at_the_end_of_an_increment_is_refused():
     raised_everywhere(problem.solve, fc.NotConverged, "is not a number")
 
 
-def test_sliding_round_an_obstacle_is_no_passage():
-    """Points that go a quarter of the way round a roller, outside of it or on it."""
+def test_sliding_around_an_obstacle_is_not_tunnelling():
+    """Points that move around a quarter of a roller, outside of it or on it, do not cross it."""
     scene = rubber(n=(16, 4), E=10.0)
     shift = fem.Constant(scene.mesh, np.zeros(2))
     _, contact = scene.problem(roller(scene, 1.0, shift), fc.Frictionless(1e3))
     for angle in (0.2, 0.8, 1.4):
-        # Γc is flat: all of it turned about the middle of the roller.
+        # All of the flat Γc rotates about the centre of the roller.
         c, s = np.cos(angle), np.sin(angle)
         centre = np.array([[0.0], [scene.height + 1.0]])
         turn = np.array([[c, -s], [s, c]])
@@ -289,11 +287,11 @@ def test_sliding_round_an_obstacle_is_no_passage():
 
 
 @pytest.mark.parametrize("shape", ["ball", "profile"])
-def test_a_turn_by_more_than_a_right_angle_is_refused(shape):
-    """A drum turned by 270° at once rubbed backwards, with all of μ N, and by 360° not at all.
+def test_rotation_by_more_than_a_right_angle_is_refused(shape):
+    """In one increment, 270° gave friction μ N backwards, and 360° gave no friction.
 
-    Cut into halves until they pass, it rubs forwards: μ times the pressure, at the lever of the
-    points, 1e-9; as a drum that has slid for long. One that no point touches turns as it likes.
+    With cut increments friction is that of steady sliding: μ times the pressure at the lever arm of
+    the points, to 1e-9 (ball) or 1e-5 (profile). Without contact any rotation is accepted.
     """
     for angle in (1.5 * np.pi, 2 * np.pi):
         tool = Tool(radius=0.8, law=fc.Coulomb(0.3, 1e4, 1e4), shape=shape)
@@ -317,7 +315,7 @@ def test_a_turn_by_more_than_a_right_angle_is_refused(shape):
         assert contact.moment(centre)[0] == pytest.approx(expected, rel=allowed)
 
 
-def test_a_turn_that_differs_from_point_to_point_is_refused():
+def test_rotation_that_varies_over_the_surface_is_refused():
     scene = rubber(n=(4, 2))
     x = ufl.SpatialCoordinate(scene.mesh)
     for angle in (0.1 * x[0], scene.u[0]):
@@ -327,11 +325,8 @@ def test_a_turn_that_differs_from_point_to_point_is_refused():
             scene.contact(obstacle, fc.Coulomb(0.2))
 
 
-def test_work_of_a_force_beside_a_turn():
-    """A roller driven by a force that may turn, and does not: the work is force times way.
-
-    By hand ½ (f₀ + f₁) Δv; to the solver's tolerance.
-    """
+def test_work_of_a_driving_force_on_a_roller_with_rotation():
+    """The work of the force on a roller with zero rotation is ½ (f₀ + f₁) Δv, to 1e-8."""
     scene = rubber(n=(8, 4), linear=True)
     force, angle = fem.Constant(scene.mesh, 0.0), fem.Constant(scene.mesh, 0.0)
     motion = fc.Motion(force=(None, force), displacement=(0.0, None))
@@ -350,8 +345,8 @@ def test_work_of_a_force_beside_a_turn():
 
 
 @pytest.mark.parametrize("linear", [True, False])
-def test_stiffness_follows_a_modulus_that_is_set_late(linear):
-    """E set after the problem was made: as if it had been there, 10 E/h; 1e-6."""
+def test_relative_stiffness_follows_a_modulus_set_later(linear):
+    """If E is set after creation of the problem, k_n is 10 E/h of the new E; to 1e-6."""
     forces = []
     for first in (1000.0, 1.0):
         scene = block("quadrilateral", n=(6, 3), E=first)
@@ -370,11 +365,11 @@ def test_stiffness_follows_a_modulus_that_is_set_late(linear):
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("late", [False, True])
-def test_slip_is_counted_from_the_start(kinematics, late):
-    """A body that stands aside at first, without load, and is pressed straight down: no slip.
+def test_initial_displacement_is_the_slip_reference(kinematics, late):
+    """A body with an initial displacement along the plate, pressed straight down, does not slip.
 
-    As from u = 0, to the round-off of so large a displacement. ``late``: it is moved after the
-    problem was made.
+    Forces are those from u = 0, to 1e-6, the round-off of the displacement. With ``late`` the
+    displacement is set after creation of the problem.
     """
     forces = []
     for aside in (0.0, 0.3):
@@ -397,10 +392,10 @@ def test_slip_is_counted_from_the_start(kinematics, late):
     assert abs(forces[0][1]) > 1.0
 
 
-def test_rubber_on_rubber_with_pairs_found_anew():
-    """A nonlinear bulk whose top is moved, and pairs that change with every commit.
+def test_rubber_on_rubber_with_updated_pairs():
+    """A nonlinear bulk whose top is moved, with pairs updated at every commit.
 
-    The force is that of one increment to what pairs found anew change, 1 %.
+    The force agrees with that of one increment to 1 %, the effect of updated pairs.
     """
     ends = []
     for steps in (1, 4):

@@ -1,6 +1,7 @@
-"""`ContactOperator` does not change, whatever is done to its contact, or over other unknowns.
+"""`ContactOperator` is immutable and independent of operators on other dofs.
 
-All comparisons are bit for bit: what is compared are two readings of the same numbers.
+Results of the operator must agree bit for bit, since two evaluations of the same numbers are
+compared.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ LAW = fc.Coulomb(0.3, k_n=1e7, k_t=1e6)
 
 
 def read(operator: ContactOperator) -> list[np.ndarray]:
-    """All that it makes of fixed states, tractions and stiffnesses, each by its own numbers."""
+    """Return results of an operator for fixed random states, tractions and stiffnesses."""
     rng = np.random.default_rng(COMM.rank)
     unknowns, n = operator.unknowns, operator.contact.quadrature.n_points
     gdim = operator.contact.surface.mesh.geometry.dim
@@ -41,13 +42,13 @@ def read(operator: ContactOperator) -> list[np.ndarray]:
 
 
 def same(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
-    """On all ranks."""
+    """Return whether arrays are equal on all ranks."""
     here = all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
     return COMM.allreduce(here, op=MPI.LAND)
 
 
-def test_an_operator_does_not_change():
-    """Not by increments, confined laws or other operators; pairs found anew take another."""
+def test_operator_is_immutable():
+    """No increment, restricted law or other operator changes it; updated pairs need another."""
     slider = Slider("triangle", LAW, start=1.0, n=(8, 3))
     contact, unknowns = slider.contact, slider.problem.full.unknowns
     kept = np.arange(0, unknowns.n_dofs, 2, dtype=np.int32)
@@ -58,7 +59,7 @@ def test_an_operator_does_not_change():
     contact.restrict_to(np.zeros(contact.quadrature.n_points, dtype=bool))
     assert same(before[0], read(whole)) and same(before[1], read(part))
     contact.restrict_to()
-    slider.step(0.002, 0.6)  # beyond the facets that were opposite
+    slider.step(0.002, 0.6)  # beyond the paired facets
     assert contact.contact_kinematics.updates_pairs
     assert same(before[0], read(whole)) and same(before[1], read(part))
     another = ContactOperator(contact, unknowns)
@@ -66,8 +67,8 @@ def test_an_operator_does_not_change():
     assert same(before[0], read(whole))
 
 
-def test_operators_over_several_unknowns_do_not_know_of_each_other():
-    """Taken in turn they make what each makes alone: contact has no unknowns of its own."""
+def test_operators_on_different_dofs_are_independent():
+    """Operators used in turn have the same results as alone, since contacts have no dofs."""
     mesh, tags = two_blocks("triangle", (5, 3))
     u = fem.Function(displacement_space(mesh, 1))
     contact = fc.Contact(
@@ -83,8 +84,8 @@ def test_operators_over_several_unknowns_do_not_know_of_each_other():
         assert same(alone[1], read(part)) and same(alone[0], read(whole))
 
 
-def test_pairs_found_anew_take_another_operator_for_their_contact_alone():
-    """The obstacle on the other side is rigid: its operator is the one that was."""
+def test_updated_pairs_replace_the_operator_of_their_contact_only():
+    """The contact with a rigid floor keeps its operator when pairs of the other change."""
     mesh, tags = two_blocks("triangle", (4, 3))
     u = fem.Function(displacement_space(mesh, 1))
     pair = fc.Contact(
@@ -107,11 +108,11 @@ def test_pairs_found_anew_take_another_operator_for_their_contact_alone():
     assert not same(old, read(after[0])) and same(old, read(before[0]))
 
 
-def test_a_matrix_in_space_has_no_entries_for_points_that_are_open():
-    """A factorisation has no more to do than what is closed now; the numbers are the same.
+def test_matrix_in_3d_has_no_entries_for_open_points():
+    """The matrix is the sum of bulk and contact tangents to 1e-14 (round-off: some 1e-16).
 
-    The matrix is the sum of the bulk's and contact's, whose round-off is some 1e-16 of it, and in a
-    pattern that holds both, and no other entry, whatever was in there before.
+    Its pattern has the entries of the bulk and the closed points only, whatever it contained
+    before, so that a factorisation costs no more than necessary.
     """
     slider = Slider("tetrahedron", LAW, start=1.0, n=(6, 2), condensation=False)
     slider.step(0.002, 0.0)

@@ -1,4 +1,4 @@
-"""Options of the command line: they reach PETSc without a line of the script's own."""
+"""Tests of command-line options, which reach PETSc without code in the script."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if made.problem.u.function_space.mesh.comm.rank == 0:
 
 @pytest.fixture
 def command_line(monkeypatch):
-    """Sets the command line; what it leaves in the database goes with the test."""
+    """Set the command line, and remove its options from the database after the test."""
     before = PETSc.Options().getAll()
 
     def say(*arguments: str) -> None:
@@ -42,8 +42,8 @@ def command_line(monkeypatch):
 @pytest.mark.skipif(COMM.size > 1, reason="starts ranks of its own")
 @pytest.mark.parametrize("ranks", [1, 2])
 @pytest.mark.parametrize("arguments", ["", "condensation=False"])
-def test_a_script_with_options(ranks: int, arguments: str) -> None:
-    """Monitors print, whichever method solves the first increment, and values are taken."""
+def test_script_takes_options_of_the_command_line(ranks: int, arguments: str) -> None:
+    """Monitors print, whichever method solves the first increment, and values take effect."""
     words = command(ranks, "-c", SCRIPT.format(arguments=arguments), "mesh.msh", "-n", "3")
     words += ["-contact_snes_monitor", "-contact_snes_max_it", "737"]
     done = subprocess.run(words, env=environment(), capture_output=True, text=True)
@@ -53,8 +53,8 @@ def test_a_script_with_options(ranks: int, arguments: str) -> None:
     assert "unused options" not in done.stderr
 
 
-def test_values_of_options(command_line) -> None:
-    """A value is what follows, be it negative or of several words; the last of two holds."""
+def test_values_of_options_are_parsed(command_line) -> None:
+    """The value of an option may be negative or have several words; the last of two applies."""
     command_line(
         *("-x", "--tb", "short", "-mine_snes_max_it", "7", "--mine_snes_max_it", "8", "mesh.msh"),
         *("-mine_number", "-1e-3", "-mine_snes_monitor", "-mine_own", "two words", "-mine_"),
@@ -72,10 +72,10 @@ def test_values_of_options(command_line) -> None:
     assert made.problem.snes.getTolerances()[3] == 8
 
 
-def test_who_wins(command_line) -> None:
-    """The command line over ``petsc_options``; what the script has put into the database over it.
+def test_precedence_of_options(command_line) -> None:
+    """The command line overrides ``petsc_options``, and the script's own options override both.
 
-    And only options of the problem's own prefix are taken, none without a prefix.
+    Only options with the problem's own prefix are taken, and none without a prefix.
     """
     command_line("-mine_snes_max_it", "7", "-mine_snes_type", "qn", "-snes_max_it", "9")
     PETSc.Options().setValue("mine_snes_type", "newtonls")
@@ -95,11 +95,11 @@ def test_who_wins(command_line) -> None:
         ("snes_rtol", "-3", "must be non-negative"),
         ("tangent_ksp_type", "gmresss", "KSP type gmresss"),
         ("continuation_snes_max_it", "-5", "must be non-negative"),
-        ("snes_qn_m", "-1", "must be a non-negative integer"),  # looked at when it is set up
+        ("snes_qn_m", "-1", "must be a non-negative integer"),  # checked when it is set up
     ],
 )
-def test_values_that_petsc_refuses(command_line, said, name, value, why) -> None:
-    """They are named with what PETSc says of them, wherever they were given."""
+def test_values_refused_by_petsc_are_named(command_line, said, name, value, why) -> None:
+    """The error names the option and PETSc's message, wherever the option was given."""
     options = {"petsc_options": {name: value}} if said == "petsc_options" else {}
     if not options:
         command_line(f"-contact_{name}", value)
@@ -108,8 +108,8 @@ def test_values_that_petsc_refuses(command_line, said, name, value, why) -> None
     raised_everywhere(lambda: Rub(method=method, **options), ValueError, *words)
 
 
-def test_one_command_line_for_all_ranks(command_line) -> None:
-    """Where the ranks were started with different ones it is the first rank's."""
+def test_command_line_of_first_rank_is_used_on_all_ranks(command_line) -> None:
+    """If the ranks have different command lines, that of the first rank is used."""
     command_line("-mine_snes_max_it", str(7 + COMM.rank))
     made = Rub(prefix="mine_")
     assert set(COMM.allgather(made.problem.snes.getTolerances()[3])) == {7}
@@ -133,8 +133,8 @@ GOOD = {
 @pytest.mark.each
 @pytest.mark.parametrize("method", [None, "newton", "continuation"])
 @pytest.mark.parametrize("condensation", [None, False])
-def test_options_that_nothing_reads(command_line, method, condensation, caplog) -> None:
-    """Misspelt ones are named, once, wherever they come from; all others are not."""
+def test_unused_options_are_named(command_line, method, condensation, caplog) -> None:
+    """Misspelt options are named once, wherever they were given, and no others are named."""
     line = ["-mine_snes_monitr", "-mine_ksp_typ", "cg", "-yours_snes_type", "qn"]
     for name, value in GOOD.items():
         line += [f"-mine_{name}", *([] if value is None else [str(value).lower()])]

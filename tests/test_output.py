@@ -1,4 +1,4 @@
-"""Values at points and cells, and the comparison with references."""
+"""Tests of values at points and cells, and of the comparison with references."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def displacement():
 
 
 def test_at_node() -> None:
-    """The value of the node itself, on every rank; no node is an error."""
+    """`at_node` returns the value at a node on every rank, and fails where there is no node."""
     u = displacement()
     assert output.at_node(u, (1.0, 0.5)) == pytest.approx([1.0, 0.5], abs=1e-14)
     with pytest.raises(ValueError, match="no node at"):
@@ -30,7 +30,7 @@ def test_at_node() -> None:
 
 
 def test_sample() -> None:
-    """Every cell once, values of a tensor of the place they are said to be of."""
+    """`sample` has every cell once, and tensor values are those at the returned points (1e-12)."""
     u = displacement()
     x, values = output.sample(ufl.grad(u), u.function_space.mesh, 2)
     assert x.shape == (18 * 3, 2) and values.shape == (18 * 3, 2, 2)
@@ -42,7 +42,7 @@ def test_sample() -> None:
 
 
 def test_compare() -> None:
-    """Relative where there is something to relate to; a miss is marked."""
+    """Errors are relative unless the reference is zero; values out of tolerance are marked."""
     entries = output.compare(
         {"a": 1.01, "b": 1e-3, "c": 2.0}, {"a": (1.0, 0.02), "b": (0.0, 1e-2), "c": (1.0, 0.5)}
     )

@@ -1,4 +1,4 @@
-"""Loads that friction cannot bear: found by limit analysis, said in words, and nothing else is."""
+"""Limit analysis reports loads above the friction limit, and no others."""
 
 import dolfinx
 import numpy as np
@@ -20,12 +20,12 @@ pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 MU = 0.3
 # ∫ r dA over the unit square, r from its middle: (√2 + asinh 1)/6 (polar coordinates).
 LEVER = (np.sqrt(2.0) + np.arcsinh(1.0)) / 6
-# An even load of size 1 along the radius turned by a right angle has this moment: ∫ r² dA.
+# A load of size r, perpendicular to the radius, has this moment: ∫ r² dA.
 TURNED = 1 / 6
 
 
 def twisted(law, n=6, **options):
-    """A cube pressed on the floor by 10, that nothing else holds, and its twisting load."""
+    """Return an unconstrained cube pressed on the floor by 10, its contact and twisting load."""
     scene = block("hexahedron", n=n, up=-10.0)
     twist, x = fem.Constant(scene.mesh, 0.0), ufl.SpatialCoordinate(scene.mesh)
     v = ufl.TestFunction(scene.u.function_space)
@@ -36,14 +36,14 @@ def twisted(law, n=6, **options):
 
 
 def overload(problem):
-    """What is found at the present state under the present load."""
+    """Return the overload that limit analysis finds for the present state and load, or None."""
     return find_overload(problem.motions, problem.full.operators, problem.full.present_load())
 
 
-def test_a_twist():
-    """Tresca's limit along a circle at every point: the moment is limit · ∫ r dA.
+def test_limit_moment_of_a_twisted_cube():
+    """With Tresca friction the limit moment about the middle is the bound times ∫ r dA.
 
-    Tolerance: 1e-2, of which half is the quadrature of r, that has a kink in the middle.
+    Tolerance 1e-2, of which half is due to the quadrature of r, which has a kink in the middle.
     """
     problem, _, twist = twisted(fc.Tresca(MU, 10.0, k_n=1e5, k_t=1e5))
     most = MU * 10.0 * LEVER / TURNED
@@ -58,10 +58,11 @@ def test_a_twist():
 
 @pytest.mark.each
 @pytest.mark.parametrize("method", [None, "newton", "lbfgs", "alternating", "continuation"])
-def test_it_ends_soon_and_says_why(method):
-    """Tresca's and Coulomb's law, by statics: below the limit solved, above it refused.
+def test_overload_is_reported_after_few_iterations(method):
+    """With Tresca and Coulomb friction 0.9 of the limit moment is solved, and 1.1 is refused.
 
-    Coulomb's pressure is not even any more where the cube is twisted; its limit is found from it.
+    Reference: statics, to 1e-6. The limit for Coulomb's law is found from the pressure of the
+    twisted cube, which is not uniform.
     """
     for law in (fc.Tresca(MU, 10.0, k_n=1e5, k_t=1e5), fc.Coulomb(MU, k_n=1e5, k_t=1e5)):
         problem, contact, twist = twisted(law, n=3, method=method)
@@ -84,16 +85,16 @@ def test_it_ends_soon_and_says_why(method):
 
         words = "overload: along the rotation about z", "Try a smaller load, more friction"
         raised_everywhere(solve, fc.NotConverged, *words)
-        # Measured: 0 to 138, of all methods one after another; continuation tries each of three
-        # stiffnesses in 25 iterations at most.
+        # Measured: 0 to 138, including fallback methods; continuation uses at most 25 iterations
+        # for each of three stiffnesses.
         assert failed[0].iterations < 200
 
 
 @pytest.mark.each
 @pytest.mark.parametrize("method", [None, "lbfgs", "newton", "alternating", "continuation"])
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
-def test_loads_that_grow_together_are_none(cell, method):
-    """What pressed before says nothing: both forces grow by a hundred at once."""
+def test_pressure_and_load_growing_together_is_no_overload(cell, method):
+    """A pressure that grows a hundredfold with the tangential load is no overload."""
     scene = block(cell, n=4, up=-0.1)
     law = fc.Coulomb(MU, k_n=1e5, k_t=1e5)
     problem, contact = scene.problem(law, [], small_displacement_tolerance=np.inf, method=method)
@@ -110,11 +111,12 @@ def test_loads_that_grow_together_are_none(cell, method):
 @pytest.mark.parametrize("method", [None, "lbfgs", "newton", "alternating", "continuation"])
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
 @pytest.mark.parametrize("by", ["top", "gap"])
-def test_a_tight_fit_is_none(by, cell, method):
-    """Squeezed by given displacements and pushed at once: soft contact could not bear it.
+def test_tight_fit_is_no_overload(by, cell, method):
+    """A block clamped by prescribed displacements and pushed in one increment is no overload.
 
-    Contact that is softened on the way has less pressure, and less friction, than there is. A
-    column of stiffness E / h on the contact's k_n, both of area 1: N = δ / (h / E + 1 / k_n).
+    Contact that is softened during the solution has less pressure and less friction than the
+    solution. Reference: a column of stiffness E / h in series with k_n, area 1:
+    N = δ / (h / E + 1 / k_n), to 1e-6.
     """
     modulus, stiffness, depth = 1000.0, 1e5, 1e-3
     scene = block(cell, E=modulus, nu=0.0, n=4)
@@ -138,11 +140,11 @@ def test_a_tight_fit_is_none(by, cell, method):
 @pytest.mark.parametrize("stiffness", [1e1, 1e3])
 @pytest.mark.parametrize("share", [0.7, 0.8, 0.97])
 @pytest.mark.parametrize("by", ["top", "gap"])
-def test_a_tight_fit_held_by_soft_multipliers_is_none(by, share, stiffness, method):
-    """The springs of the first round alone would not bear the push; multipliers do.
+def test_tight_fit_with_multipliers_and_soft_springs_is_no_overload(by, share, stiffness, method):
+    """The load exceeds the limit of the springs before augmentation, but not that of multipliers.
 
-    Nothing gives but the column, of stiffness E / h: N = δ E / h. Springs may still bear a share of
-    N as large as the tolerance, so that N misses E / (h k) times that, and the solution another.
+    Reference: only the column deforms, N = δ E / h. The penalty part may be as large as the
+    tolerance times N, which changes N by E / (h k) times that; one tolerance is added.
     """
     modulus, depth, tolerance = 1000.0, 1e-3, 1e-6
     scene = block("quadrilateral", E=modulus, nu=0.0, n=4)
@@ -165,7 +167,7 @@ def test_a_tight_fit_held_by_soft_multipliers_is_none(by, share, stiffness, meth
     assert found.normal_force == pytest.approx(force, rel=(1 + modulus / stiffness) * tolerance)
 
 
-# Body forces on an area of 2, and what the error must say of their resultant and of the contact.
+# Body forces on an area of 2, and the error text about their resultant and the contact force.
 NOT_HELD = {
     "falls": ((0.0, -1.0), "translation along y) is -2, of which contact can balance at most 0 "),
     "pushed": ((2.0, 5.0), "translation along x) is 4, of which contact can balance at most 3 "),
@@ -174,11 +176,11 @@ NOT_HELD = {
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("what", NOT_HELD)
-def test_rubber_that_nothing_holds_any_more(what, kinematics):
-    """Pressed against a ceiling by a body force of 5, then let fall, or pushed by too much.
+def test_unconstrained_rubber_is_refused_with_limit_load(what, kinematics):
+    """Rubber pressed against a ceiling by a body force of 5 then falls, or is pushed by too much.
 
-    The error names the motion, the load along it, and the largest contact force along it, by
-    statics: 0 or μ N = 0.3 · 10. It is raised after the first failure of Newton's method, which
+    The error states the rigid-body mode, the load along it, and the largest contact force along it,
+    by statics 0 or μ N = 0.3 · 10. It is raised after the first failure of Newton's method, which
     stops after 14 iterations without a lower residual.
     """
     scene = rubber("quadrilateral", n=(8, 4))
@@ -203,11 +205,12 @@ def test_rubber_that_nothing_holds_any_more(what, kinematics):
 
 @pytest.mark.whole
 @pytest.mark.parametrize("method", [None, "lbfgs", "newton", "alternating", "continuation"])
-def test_soft_multipliers_that_hardly_grow_are_not_at_their_end(method):
-    """A hundredth as stiff as the column, they take over 1 % of what they miss in a round.
+def test_slow_augmentations_are_continued_to_equilibrium(method):
+    """Augmentations that change multipliers by less than the tolerance are continued if needed.
 
-    That is less than their tolerance of 4 % long before they bear the push. Friction bears all of
-    it in the end, to the residual.
+    Springs of a hundredth of the column's stiffness correct 1 % of the error per augmentation, less
+    than the tolerance of 4 %, long before friction balances the load. Reference: in the end
+    friction balances it to 1e-6.
     """
     modulus, stiffness = 1000.0, 10.0
     scene = block("quadrilateral", E=modulus, nu=0.0, n=2)
@@ -228,12 +231,12 @@ def test_soft_multipliers_that_hardly_grow_are_not_at_their_end(method):
         assert found == pytest.approx(-share * MU * force, rel=1e-6)
 
 
-def test_blocks_on_both_sides_do_not_hide_an_overload():
-    """A block squeezed by two others, with nothing else to hold it, is pushed by 2 % too much.
+def test_overload_of_a_clamped_block_is_reported():
+    """A block constrained only by two clamping blocks is reported at 2 % above the friction limit.
 
-    Under a tenth of what squeezed it before, its multipliers fluctuate by more than their tolerance
-    while it runs away, and by less than friction lacks. Measured: 1255 iterations; 6995 if the
-    augmentations continue to the tolerance.
+    At a tenth of the previous clamping force its multipliers fluctuate, while it slides, by more
+    than their tolerance and by less than the missing friction. Measured: 1255 iterations; 6995 if
+    the augmentations continue to the tolerance.
     """
     modulus, height = 1000.0, 0.5
 
@@ -273,7 +276,10 @@ def test_blocks_on_both_sides_do_not_hide_an_overload():
 
 
 def groove(angle, n):
-    """A wedge in a V groove, its sides at an angle from the vertical; loads down and along it."""
+    """Return the problem of a wedge in a V groove, its contacts, its load and its volume.
+
+    The sides of the groove are at an angle from the vertical.
+    """
     mesh = dolfinx.mesh.create_box(
         MPI.COMM_WORLD, [(-0.5, 0.0, 0.0), (0.5, 1.0, 1.0)], n, dolfinx.mesh.CellType.hexahedron
     )
@@ -301,12 +307,12 @@ def groove(angle, n):
 
 
 @pytest.mark.parametrize(("n", "share", "before"), [((1, 2, 1), 0.9, 0.0), ((2, 2, 2), 0.8, 100.0)])
-def test_a_wedge_in_a_groove_is_none(n, share, before):
-    """Both sides press with N = P/(2 sin α), so that 2 μ N is borne along the groove.
+def test_wedge_in_a_groove_below_its_limit_is_no_overload(n, share, before):
+    """A wedge pushed along its groove by less than 2 μ N, N = P/(2 sin α), is no overload.
 
-    With more friction than there is, friction bears a part of P, too, and the sides press less: by
-    those pressures both are overloads. The first is pressed and pushed at once, the second pressed
-    by a hundred times as much before.
+    At a larger friction coefficient friction also balances a part of P, and N decreases: with those
+    pressures both cases would be overloads. The first one is pressed and pushed in one increment,
+    the second was pressed by a hundred times as much before. Reference: the load, to 1e-7.
     """
     angle, down = np.radians(10.0), 10.0
     problem, contacts, load, volume = groove(angle, n)
@@ -321,8 +327,8 @@ def test_a_wedge_in_a_groove_is_none(n, share, before):
     assert force == pytest.approx([0.0, -along, down], rel=1e-7, abs=1e-7 * down)
 
 
-def test_the_larger_friction_of_two():
-    """An ellipse bears across its direction what the limit along it would not."""
+def test_transverse_friction_of_an_ellipse_is_no_overload():
+    """An ellipse balances a transverse load that is above the limit along its direction."""
     scene = block("hexahedron", n=3, size=(1.0, 1.0, 0.25), up=-10.0)
     law = fc.Coulomb(MU, 1e5, 1e5, transverse_friction=2 * MU, direction=(0.0, 1.0, 0.0))
     problem, contact = scene.problem(law, [], small_displacement_tolerance=np.inf)
@@ -334,8 +340,11 @@ def test_the_larger_friction_of_two():
     assert contact.resultants().force[0] == pytest.approx(-1.8 * MU * 10.0, rel=1e-6)
 
 
-def test_polygons_and_where_nothing_is_told():
-    """A polygon's corners count; forces without limit, and obstacles that turn, are left alone."""
+def test_limit_analysis_of_polygons_and_unsupported_cases():
+    """The limit of a polygon is at its corners; unsupported cases are never overloads.
+
+    Those are foundations, finite kinematics and rotating obstacles.
+    """
     for modes, most in ((None, 1.0), (4, np.sqrt(2.0))):
         scene = block("hexahedron", n=2, size=(1.0, 1.0, 0.25), up=-10.0)
         law = fc.Tresca(MU, 10.0, 1e5, 1e5, modes=modes, direction=modes and (1.0, 0.0, 0.0))

@@ -1,4 +1,4 @@
-"""A law of the user's own: an exponential overclosure, with friction and without."""
+"""User-defined laws: an exponential overclosure, with and without friction."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ E, NU = 1000.0, 0.3
 P0, H = 0.5, 2e-3
 
 
-# ---- against closed answers ----------------------------------------------------------------------
+# ---- closed-form solutions -----------------------------------------------------------------------
 
-# Newton's method and L-BFGS to 1e-9 of the forces; of the overclosure that is as much of h.
+# Newton's method and L-BFGS converge to 1e-9 of the forces, so overclosures to 1e-9 of h.
 EXACT = 1e-7
 METHODS = ("lbfgs", "newton", "continuation", "alternating")
 
@@ -39,9 +39,9 @@ METHODS = ("lbfgs", "newton", "continuation", "alternating")
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_overclosure(cell, method, condensation):
-    """A block pressed uniformly: δ = h ln(p/p0) everywhere, and the energy is conserved.
+    """A block under uniform pressure has δ = h ln(p/p0) everywhere, and energy is conserved.
 
-    With the first increment p < p0, so that the law acts at a distance, then more.
+    In the first increment p < p0, so that the law acts across an open gap; then p is larger.
     """
     scene = block(cell, E=E, nu=NU)
     law = Overclosure(P0, H)
@@ -54,7 +54,7 @@ def test_overclosure(cell, method, condensation):
         overclosure = -gathered(COMM, contact.gap)
         assert close(overclosure, H * np.log(p / P0) * _ones(contact), EXACT, scale=H)
         problem.commit()
-    # Work of the load by the trapezoidal rule is not that of a nonlinear law; its springs are.
+    # For a nonlinear law the trapezoidal work is inexact; the energy of its springs is exact.
     assert step.energy.springs == pytest.approx(H * (20.0 - 3.0), rel=1e-6)
 
 
@@ -64,11 +64,11 @@ def _ones(contact):
 
 @pytest.mark.parametrize("condensation", [None, False])
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_a_bond_led_back_to_no_load(cell, condensation):
-    """An adhesive that softens, pulled to half of its strength and let go, twice over, and again.
+def test_softening_adhesive_is_unloaded(cell, condensation):
+    """A softening adhesive is pulled, up to half of its strength, and unloaded several times.
 
-    What is left are displacements of round-off, in which the law's potential has no digit right.
-    The pull is k o exp(-o/h) = p at every point (1e-7 of the forces); without load nothing is left.
+    What remains are displacements of round-off, in which the law's potential has no correct digit.
+    The tension is k o exp(-o/h) = p at every point, to 1e-7 of the forces, and zero without load.
     """
     scene = block(cell, E=E, nu=NU)
     bond = Bond(k_n=1e3, h=1e-2)
@@ -83,12 +83,12 @@ def test_a_bond_led_back_to_no_load(cell, condensation):
         assert close(1e3 * opening * np.exp(-opening / 1e-2), pull * _ones(contact), EXACT, scale=1)
 
 
-def test_pressures_that_fall_by_a_factor_in_each_iteration():
-    """Loaded from a gap of H: the first step ends tens of H too deep.
+def test_newton_recovers_from_a_step_that_is_too_deep():
+    """Loaded from a gap of H, the block ends tens of H too deep after the first step.
 
-    From there an exponential falls by e in every iteration of Newton's method, which ends before
-    other methods are tried. Reference: the closed form of the gap under a pressure, to the
-    residual's 1e-9 of it.
+    From there an exponential pressure falls by a factor e in every iteration of Newton's method,
+    which converges before other methods are tried. Reference: the closed form of the gap under a
+    pressure, to 1e-8, as the residual is 1e-9 of the pressure.
     """
     scene = block("quadrilateral", E=1000.0, nu=0.0)
     apart = {"obstacle": fc.HalfSpace((0.0, -H), (0.0, 1.0))}
@@ -102,7 +102,7 @@ def test_pressures_that_fall_by_a_factor_in_each_iteration():
 
 
 def test_any_units():
-    """The same in MPa and in Pa, in metres and in micrometres: relative results are equal."""
+    """Relative results are the same in MPa and Pa, in metres and micrometres, to 1e-7."""
     found = []
     for force, length in ((1.0, 1.0), (1e6, 1.0), (1.0, 1e6)):
         size = [length, length]
@@ -118,7 +118,10 @@ def test_any_units():
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_overclosure_with_friction(cell, method, condensation):
-    """Pressed by its top, dragged until all slips, and back: T = ±μN, p = p0 (exp(δ/h) - 1)."""
+    """All points of a block dragged back and forth slip: T = ±μN, p = p0 (exp(δ/h) - 1).
+
+    The displacement of its top is prescribed.
+    """
     mu = 0.3
     scene = block(cell, E=E, nu=NU, n=3)
     d = scene.dim
@@ -147,7 +150,7 @@ def test_overclosure_with_friction(cell, method, condensation):
 
 
 def dragged(law, cell="quadrilateral", **options):
-    """A block pressed on a plane by its top and dragged until all slips."""
+    """Return a block pressed on a plane by its top and dragged until all points slip."""
     scene = block(cell, E=E, nu=NU, n=3)
     d = scene.dim
     push, press = (scene.hold(TOP, i) for i in (0, d - 1))
@@ -160,22 +163,23 @@ def dragged(law, cell="quadrilateral", **options):
 @pytest.mark.parametrize("condensation", [None, False])
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
-def test_friction_that_does_not_grow_as_the_pressure(cell, method, condensation):
-    """All slips: |τ| is the limit under the pressure at every point, to the solver's 1e-9."""
+def test_friction_bound_nonlinear_in_the_pressure(cell, method, condensation):
+    """All points slip: |τ| is the friction bound at their pressure, to the solver's 1e-9."""
     mu, strength = 0.5, 4.0
     law = Saturating(mu, strength, fc.RelativeStiffness(), fc.RelativeStiffness())
     _, problem, contact = dragged(law, cell, method=method, condensation=condensation)
     step = problem.solve()
     assert step.verdict.failures == [] and step.contacts["contact"].stick == 0
     p, tau = (gathered(COMM, v) for v in (contact.pressure, contact.tangential_traction))
-    assert mu * p.max() > 2 * strength  # far from Coulomb's
+    assert mu * p.max() > 2 * strength  # far from Coulomb's law
     assert close(np.linalg.norm(tau, axis=1), strength * (1 - np.exp(-mu * p / strength)), 1e-9)
 
 
-def test_its_error_is_estimated_by_its_derivative():
-    """Friction of a soft penalty against that of one 1000 times as stiff: estimated within 30 %.
+def test_enforcement_error_uses_the_derivative_of_the_friction_bound():
+    """The error of the friction of a soft penalty is estimated within 30 %.
 
-    With the pressure itself for measure, as Coulomb's would have it, it would be 5 times too large.
+    Reference: a penalty 1000 times as stiff. With the pressure instead of the derivative of the
+    friction bound, as for Coulomb's law, the estimate would be 5 times too large.
     """
     found = []
     for factor in (3.0, 3e3):
@@ -190,11 +194,11 @@ def test_its_error_is_estimated_by_its_derivative():
     assert soft.parts["enforcement"][name] == pytest.approx(error, rel=0.3)
 
 
-# ---- what is refused, and what is found out ------------------------------------------------------
+# ---- refused input, and errors found by the verdict ----------------------------------------------
 
 
 def test_multipliers_are_refused():
-    """They would take the stiffness away that the law is about."""
+    """Multipliers would remove the stiffness that the law describes: they are refused."""
     scene = block()
     raised_everywhere(
         lambda: scene.contact(Overclosure(P0, H), enforcement="augmented"),
@@ -205,8 +209,8 @@ def test_multipliers_are_refused():
     assert scene.contact(Overclosure(P0, H), accuracy="standard").multipliers is None
 
 
-def test_a_law_that_does_not_say_enough():
-    """Without k_n a potential is wanted, and k_t where there is friction; each by its name."""
+def test_incomplete_laws_are_refused():
+    """Without k_n a law needs a potential, with friction k_t; the error names it."""
 
     @dataclass(frozen=True)
     class Silent(Law):
@@ -236,14 +240,14 @@ def test_a_law_that_does_not_say_enough():
     )
 
 
-def test_a_potential_of_another_law():
-    """A response and a potential that do not belong together are found by the verdict."""
+def test_inconsistent_potential_is_caught():
+    """The verdict detects a traction that is not the derivative of the potential."""
 
     class Wrong(Overclosure):
-        """Its energy is too large by a thousandth."""
+        """An overclosure whose energy is too large by a thousandth."""
 
         def normal_potential(self, kinematics, parameters):
-            """∫ p dδ, nearly."""
+            """Return ∫ p dδ, too large by a thousandth."""
             return 1.001 * super().normal_potential(kinematics, parameters)
 
     scene = block(up=-3.0)
@@ -252,46 +256,46 @@ def test_a_potential_of_another_law():
         problem.solve()
 
 
-def test_a_limit_of_another_law():
-    """A response with another friction bound than `Law.friction_bound` is found by the verdict."""
+def test_inconsistent_friction_bound_is_caught():
+    """The verdict detects a traction with another friction bound than `Law.friction_bound`."""
 
     class Wrong(Saturating):
-        """It slides at the limit of another strength than the one that it tells."""
+        """A law that slips at the bound of another strength than that of its parameters."""
 
         def contact_traction(self, kinematics, parameters):
-            """That of a layer as strong again."""
+            """Return the traction of a layer of twice the strength."""
             more = {**parameters, "strength": 2 * parameters["strength"]}
             return super().contact_traction(kinematics, more)
 
     _, problem, _ = dragged(Wrong(0.5, 4.0, fc.RelativeStiffness(), fc.RelativeStiffness()))
     with pytest.raises(fc.NotConverged, match="friction bound violated by") as caught:
         problem.solve()
-    # Smaller increments would not mend it.
+    # Smaller increments are no remedy.
     assert "contact_traction, friction_bound and normal_potential" in str(caught.value)
     assert "smaller increments" not in str(caught.value)
 
 
 @dataclass(frozen=True)
 class RootOfPenetration(fc.Law):
-    """A pressure c √δ₋, whose derivative is infinite at first contact and NaN where it is open."""
+    """A pressure c √δ₋, whose derivative is infinite at first contact and NaN at open points."""
 
     c: Any
 
     def contact_traction(self, kinematics, parameters):
-        """The pressure, without friction."""
+        """Return the pressure, without friction."""
         penetration = ufl.max_value(-kinematics.gap, 0)
         return ContactTraction(-parameters["c"] * penetration**0.5)
 
     def normal_potential(self, kinematics, parameters):
-        """∫ p dδ."""
+        """Return ∫ p dδ."""
         return parameters["c"] * ufl.max_value(-kinematics.gap, 0) ** 1.5 / 1.5
 
 
 @pytest.mark.parametrize("condensation", [None, False])
-def test_a_derivative_that_is_not_finite(condensation):
-    """On a curved obstacle it makes a diverged state: refused as such, with u and loads restored.
+def test_non_finite_derivative_is_refused(condensation):
+    """A non-finite derivative on a curved obstacle is refused, and u and loads are restored.
 
-    The verification looks at that state, at points that are nowhere.
+    The verification evaluates the diverged state, whose points have no finite position.
     """
     scene = block(E=E, nu=NU, n=3)
     ball = fc.Ball((0.5, -2.0), 2.0)
@@ -303,13 +307,13 @@ def test_a_derivative_that_is_not_finite(condensation):
     )
     scene.load(up=-0.2)
     text = raised_everywhere(problem.solve, fc.NotConverged, "not finite", "user-defined law")
-    assert "its size" not in text  # NaN is no deformation
+    assert "its size" not in text  # NaN does not count as deformation
     assert problem.increment == 0 and np.all(scene.u.x.array == 0.0)
     assert np.isfinite(gathered(COMM, contact.gap)).all()
 
 
-def test_what_to_try_is_what_the_law_has():
-    """No lower k_n of a law that has none; of the package's own there are both."""
+def test_remedies_name_the_stiffnesses_of_the_law():
+    """A lower k_n or k_t is suggested only if the law has this parameter."""
     for law, words in (
         (
             Asperities(0.3, P0, H, fc.RelativeStiffness()),
@@ -324,8 +328,8 @@ def test_what_to_try_is_what_the_law_has():
         assert words in str(caught.value)
 
 
-def test_a_parameter_that_the_law_does_not_have():
-    """Its name, and those that there are, before anything is compiled."""
+def test_unknown_parameter_is_refused():
+    """Before compilation the error names the unknown parameter and those of the law."""
 
     @dataclass(frozen=True)
     class Capped(fc.Coulomb):
@@ -343,8 +347,8 @@ def test_a_parameter_that_the_law_does_not_have():
     )
 
 
-def test_a_parameter_with_a_name_of_the_contact():
-    """The weight of the contact would be that of the law, and the other way round."""
+def test_parameter_with_a_name_of_the_contact_is_refused():
+    """A law's parameter `weight` would be confused with the weight of the contact."""
 
     @dataclass(frozen=True)
     class Weighed(Overclosure):
@@ -356,8 +360,8 @@ def test_a_parameter_with_a_name_of_the_contact():
 
 
 @pytest.mark.parametrize(("name", "value"), [("p0", 0.0), ("h", -1.0), ("h", np.nan)])
-def test_parameters_of_an_own_law(name, value):
-    """They are checked as those of the others."""
+def test_invalid_parameters_of_a_user_defined_law_are_refused(name, value):
+    """Parameters of a user-defined law are checked as those of the package's laws."""
     scene = block()
     law = replace(Overclosure(P0, H), **{name: value})
     raised_everywhere(lambda: scene.contact(law), ValueError, "contact", name)
@@ -365,22 +369,25 @@ def test_parameters_of_an_own_law(name, value):
 
 @dataclass(frozen=True)
 class Beside(fc.Frictionless):
-    """A law that takes what it depends on past its parameters."""
+    """A law that depends on something that is not one of its parameters."""
 
     hidden: Any = None
 
     def parameters(self) -> dict[str, Any]:
-        """The stiffness alone."""
+        """Return the stiffness alone."""
         return {"k_n": self.k_n}
 
     def contact_traction(self, kinematics, parameters):
-        """More pressure than the parameters say."""
+        """Return a larger pressure than that of the parameters."""
         told = super().contact_traction(kinematics, parameters)
         return replace(told, normal_traction=(1 + self.hidden) * told.normal_traction)
 
 
-def test_what_is_no_parameter_is_refused():
-    """A place, a function of the body, u, or a constant, which no checkpoint would tell apart."""
+def test_dependence_on_other_than_parameters_is_refused():
+    """A law may not depend on position, u or constants except by its parameters.
+
+    A checkpoint could not distinguish such laws.
+    """
     scene = block("quadrilateral", E=E, nu=NU)
     x = ufl.SpatialCoordinate(scene.mesh)
     for hidden in (x[0], scene.u[0] ** 2, fem.Constant(scene.mesh, 0.1)):

@@ -1,4 +1,4 @@
-"""What packages say of the project is what the project says of itself."""
+"""The metadata of the packages agree with those of the project."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SPACK = ROOT / "packaging" / "spack_repo" / "fenics_contact" / "packages" / "py_
 
 
 def name_and_bound(requirement: str) -> tuple[str, str]:
-    """Of ``a>=1``, ``a >=1`` and ``a@1:+variant``: a and 1."""
+    """Return a and 1 for the requirements ``a>=1``, ``a >=1`` and ``a@1:+variant``."""
     name, bound = re.fullmatch(r"([a-z0-9-]+)\s*(?:(?:>=|@)([\d.]+))?.*", requirement).groups()
     return name, bound or ""
 
@@ -25,8 +25,8 @@ DEPENDENCIES = sorted(map(name_and_bound, PROJECT["dependencies"]))
 PYTHON = PROJECT["requires-python"].removeprefix(">=")
 
 
-def test_the_version_is_one() -> None:
-    """Of the package, the citation and the recipe; and the changelog has it, or has no release."""
+def test_version_is_the_same_everywhere() -> None:
+    """Package, citation and recipe have one version; it is the last in the changelog, if any."""
     version = fenics_contact.__version__
     citation = (ROOT / "CITATION.cff").read_text()
     assert re.findall(r"^version: (\S+)$", citation, re.MULTILINE) == [version]
@@ -35,15 +35,15 @@ def test_the_version_is_one() -> None:
     assert released[:1] in ([], [version])
 
 
-def test_one_release_of_the_linter() -> None:
-    """In the checks and before a commit, and in the extra "dev"; sdists are without the former."""
+def test_linter_version_is_the_same_everywhere() -> None:
+    """Checks, pre-commit and the extra "dev" have one linter version; sdists lack some files."""
     files = [ROOT / ".ci" / "run", ROOT / ".pre-commit-config.yaml", ROOT / "pyproject.toml"]
     text = "".join(file.read_text() for file in files if file.exists())
     assert len(set(re.findall(r"\"ruff(==.*?)\"", text))) == 1
 
 
-def test_the_recipe_requires_what_the_package_does() -> None:
-    """conda-forge's names are those of PyPI; it says besides that PETSc is real."""
+def test_recipe_has_the_dependencies_of_the_package() -> None:
+    """The recipe has the dependencies of the package, by the same names, and a real PETSc."""
     run = re.search(r"\n  run:\n(.*?)\n\n", RECIPE, re.DOTALL).group(1)
     wanted = re.findall(r"^    - (.*)$", run, re.MULTILINE)
     assert wanted[0] == "python >=${{ python_min }}" and wanted[-1] == "petsc * real_*"

@@ -1,7 +1,7 @@
-"""Which facets are opposite, what points without an opposite bear, what passes between points.
+"""Rules of pairing, points without an opposite point, and penetration between points.
 
-References are closed answers or invariants; the solver's tolerance on forces is 1e-9, so that
-what is solved for is met to 1e-8, and what follows from the same arrays to round-off.
+References are closed-form solutions or invariants. The solver's tolerance on forces is 1e-9, so
+that solutions are accurate to 1e-8, and values computed from the same arrays to round-off.
 """
 
 import warnings
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.mpi
 
 @contextmanager
 def _told(expected, *words):
-    """Assert that there is a warning with these words, on every rank, or none at all."""
+    """Assert that a warning with these words is given on every rank, or no warning at all."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         yield
@@ -41,11 +41,11 @@ def _told(expected, *words):
     assert all(flag == expected for flag in COMM.allgather(found)), texts
 
 
-# ---- what is opposite ----------------------------------------------------------------------------
+# ---- opposite facets ----------------------------------------------------------------------------
 
 
 def plates(cell, thickness, apart, *, layers=2, bend=None, degree=1):
-    """Plates of length 1 one over the other, BOTH on all their tops and bottoms."""
+    """Return axes and tags of plates of length 1 stacked vertically, tops and bottoms in BOTH."""
     d = 3 if cell in ("tetrahedron", "hexahedron") else 2
     axes, flats, low = [], [], 0.0
     counts = (6, 9, 7)
@@ -64,10 +64,10 @@ def plates(cell, thickness, apart, *, layers=2, bend=None, degree=1):
 
 @pytest.mark.parametrize("layers", [1, 3])
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
-def test_a_plate_is_not_opposite_its_own_back(cell, layers):
-    """Plates of 0.05 lifted apart by 0.2, their tops and bottoms all in one tag: nothing acts.
+def test_plate_is_not_paired_with_its_own_back(cell, layers):
+    """Plates of thickness 0.05 with a gap of 0.2, all tops and bottoms in one tag: no forces.
 
-    The pairs across the gap are there, and the outer faces have none.
+    Points at the gap have pairs, those of the outer faces have none.
     """
     axes, marks = plates(cell, 0.05, [0.2], layers=layers)
     marks = {BOTH: marks[BOTH]}
@@ -84,8 +84,8 @@ def test_a_plate_is_not_opposite_its_own_back(cell, layers):
 
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
-def test_lifted_plates_bear_nothing(cell):
-    """A plate lifted by four times its thickness, and moved down onto the other one again."""
+def test_lifted_plates_have_no_contact_force(cell):
+    """A plate is lifted by four times its thickness and lowered again, twice: springs in series."""
     sunk, k_n = 1e-3, 1e7
     axes, marks = plates(cell, 0.05, [0.0])
     d = len(axes[0])
@@ -109,8 +109,8 @@ def test_lifted_plates_bear_nothing(cell):
 
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
-def test_leaves_in_one_tag(cell):
-    """Three thin leaves, all their faces Γc and opposite: each joint bears q, evenly."""
+def test_three_plates_in_one_tag(cell):
+    """Γc and obstacle are all faces of three thin plates: each joint transfers q, to 1e-8."""
     q, k_n = 5e3, 1e7
     axes, marks = plates(cell, 0.02, [0.0, 0.0], layers=1)
     d = 3 if cell == "hexahedron" else 2
@@ -133,8 +133,8 @@ def test_leaves_in_one_tag(cell):
     assert np.all(points["pressure"][~inner] == 0.0)
 
 
-def test_a_long_facet_in_front_of_short_ones():
-    """The nearest of all facets is met, also where many a middle is nearer than its own."""
+def test_long_facet_in_front_of_short_ones_is_paired():
+    """Points are paired with the nearest facet, even if midpoints of many others are nearer."""
     axes = [
         [np.linspace(0, 1, 81), np.array([-0.05, 0.0])],
         [np.array([0.0, 1.0]), np.array([0.01, 0.02])],
@@ -148,10 +148,10 @@ def test_a_long_facet_in_front_of_short_ones():
 
 
 @pytest.mark.parametrize("opening", [0.0, 0.05])
-def test_lips_of_a_notch_meet_down_to_its_root(opening):
-    """Lips whose cells share the root are opposite each other, though of one body.
+def test_notch_faces_are_paired_up_to_the_root(opening):
+    """Faces of a notch are paired, though of one body and with the root in common.
 
-    A square of 2 × 2, cut from its right side to its middle; opened to a wedge.
+    A square of 2 × 2, cut from its right side to its middle; closed, or opened to a wedge.
     """
     contact = Bodies(cut_square(8, opening), E, 0.3).contact(FLOOR, ROOF, fc.Frictionless(1e7))
     assert contact.n_unpaired == 0
@@ -161,7 +161,7 @@ def test_lips_of_a_notch_meet_down_to_its_root(opening):
 
 
 def cut_square(n, opening):
-    """A square of n × n cells on [-1, 1]², cut along y = 0 < x; FLOOR over the cut, ROOF under."""
+    """Mesh [-1, 1]² with n × n cells, cut along y = 0 < x; FLOOR above the cut, ROOF below it."""
     line = np.linspace(-1, 1, n + 1)
     x = np.array([(a, b) for b in line for a in line])
     number = np.arange(len(x)).reshape(n + 1, n + 1)
@@ -186,8 +186,8 @@ def cut_square(n, opening):
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_interference_deeper_than_the_cells(cell, kinematics):
-    """Blocks that overlap by 0.2, twice the height of their cells: they are opposite, all over."""
+def test_interference_deeper_than_a_cell_is_paired(cell, kinematics):
+    """Blocks that overlap by 0.2, twice the height of their cells, have pairs everywhere."""
     body = stack(cell, (10, 10) if cell == "triangle" else (4, 5), (0.5, 0.5), apart=-0.2)
     contact = joint(body, 1, fc.Frictionless(1e6), kinematics=kinematics)
     contact.evaluate()
@@ -196,8 +196,8 @@ def test_interference_deeper_than_the_cells(cell, kinematics):
     assert close(gap, np.full(len(gap), -0.2), 1e-12)
 
 
-def test_release():
-    """The bound is the user's where it is given; a negative one is refused."""
+def test_max_initial_penetration():
+    """A given ``max_initial_penetration`` bounds pairs; a negative one is refused."""
     body = stack("quadrilateral", (10, 10), (0.5, 0.5), apart=-0.2)
     law = fc.Frictionless(1e6)
     for release, unpaired in ((0.25, False), (0.15, True)):
@@ -213,7 +213,7 @@ def test_release():
 
 
 def test_soft_contact_keeps_its_pairs():
-    """Springs so soft that the bodies pass through each other by three cells: still opposite."""
+    """Bodies with springs so soft that they overlap by several cells still have pairs."""
     body = stack("quadrilateral", (8, 10), (0.5, 0.5))
     body.hold(FLOOR, 0, 1)
     down = body.constant(0.0)
@@ -230,11 +230,11 @@ def test_soft_contact_keeps_its_pairs():
         assert close(contact.resultants().normal_force, depth, 1e-4)
 
 
-# ---- points without an opposite ------------------------------------------------------------------
+# ---- points without an opposite point ------------------------------------------------------------
 
 
 def overhang(cell, law, *, tags=(LOWER,), gap=-0.01, **options):
-    """A slab of width 1 on a pillar of 0.6, both clamped outside, with an interference of 0.01."""
+    """Set up a slab of width 1 on a pillar of 0.6, both clamped, with an interference of 0.01."""
     body = stack(cell, (5, 8), (0.5, 0.25), widths=[0.6, 1.0], nu=0.3)
     body.hold(FLOOR, *range(body.d))
     body.lift = body.constant(0.0)
@@ -247,7 +247,7 @@ def overhang(cell, law, *, tags=(LOWER,), gap=-0.01, **options):
 
 
 def reaction(body, tag):
-    """Force that the obstacle on a side exerts on the bodies, by assembly of the bulk alone."""
+    """Return the reaction of the Dirichlet condition on a side, by assembly of the bulk alone."""
     space = body.u.function_space
     residual = fem.Function(space)
     fem.assemble_vector(residual.x.array, fem.form(body.F))
@@ -271,8 +271,8 @@ LAWS = {
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 @pytest.mark.parametrize("name", LAWS)
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_a_prescribed_gap_over_an_edge(cell, name, enforcement):
-    """What is reported is what the obstacles feel, whatever the law; what overhangs is open."""
+def test_prescribed_gap_at_an_overhang(cell, name, enforcement):
+    """Contact forces balance the reactions, 1e-7, for every law; overhanging points are open."""
     law = LAWS[name]
     if enforcement == "augmented" and (law.is_physical or cell == "hexahedron"):
         pytest.skip("no multipliers for a physical layer; once is enough")
@@ -306,8 +306,8 @@ def test_a_prescribed_gap_over_an_edge(cell, name, enforcement):
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_files_tell_what_has_no_opposite(cell, tmp_path):
-    """No gap there (NaN), no pressure, open; and "paired" says where."""
+def test_files_mark_points_without_an_opposite_point(cell, tmp_path):
+    """Where "paired" is 0, files have no gap (NaN), no pressure and the status open."""
     folder = shared_folder(tmp_path)
     body, contact, outside = overhang(cell, fc.Coulomb(0.3, 1e7, 1e7))
     problem = body.problem(contact)
@@ -327,8 +327,8 @@ def test_files_tell_what_has_no_opposite(cell, tmp_path):
     assert 0 < np.count_nonzero(share == 0.0) < len(share)
 
 
-def test_checks_see_tractions_where_nothing_is_opposite():
-    """A traction at a point without an opposite breaks the laws, whatever its size."""
+def test_tractions_of_unpaired_points_violate_the_laws():
+    """A traction at a point without an opposite point violates complementarity."""
     _, contact, _ = overhang("triangle", fc.Frictionless(1e7))
     contact.evaluate()
     assert check_laws(contact)["complementarity"] <= 1e-12
@@ -336,8 +336,8 @@ def test_checks_see_tractions_where_nothing_is_opposite():
     assert check_laws(contact)["complementarity"] > 1e-10
 
 
-def test_the_warning_says_how_many_and_why():
-    """More than half of the points without an opposite: told on all ranks, with the reason."""
+def test_warning_states_number_and_cause_of_unpaired_points():
+    """If more than half of the points have no opposite point, all ranks warn, with the cause."""
     axes = [
         [np.linspace(0, 1, 9), np.linspace(0, 0.5, 3)],
         [np.linspace(0, 1, 9), np.linspace(0.6, 1, 3)],
@@ -361,19 +361,19 @@ def test_the_warning_says_how_many_and_why():
             assert made(here, there, **options).n_unpaired == 16
 
 
-# ---- what passes between the points --------------------------------------------------------------
+# ---- penetration between the points --------------------------------------------------------------
 
 
 def undetected(step):
-    """What the verdict of a step found at the deformed positions, in words."""
+    """Return the failures of the verdict's check of penetration and tunnelling."""
     conditions = (c for name, t in step.verdict.tunnelling.items() for c in t.conditions(name))
     return [each.failure for each in conditions if not each.holds]
 
 
 def indented(cell, width, depth, *, coarse=2, swap=False, both=False, raised=0.0, fine=2):
-    """A block of ``coarse`` cells on its top, and over its middle a narrow one, moved down.
+    """Set up a block with ``coarse`` cells at its top, and a narrow indenter above a facet.
 
-    Γc has two points along a side of a facet, however small those opposite are.
+    Γc has two points along a side of a facet, however small the opposite facets are.
     """
     d = 3 if cell in ("hexahedron", "tetrahedron") else 2
     wide = np.linspace(0, 1, coarse + 1)
@@ -405,10 +405,10 @@ def indented(cell, width, depth, *, coarse=2, swap=False, both=False, raised=0.0
 
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
-def test_a_narrow_indenter_does_not_pass(cell):
-    """An indenter of 0.05 between points 0.29 apart is refused, and told what to do.
+def test_undetected_narrow_indenter_is_refused(cell):
+    """An indenter of width 0.05 between points at a distance of 0.29 fails, with a remedy.
 
-    With the surfaces swapped, or from both sides, it is held up.
+    With surfaces swapped, or Γc on both sides, contact forces balance the reaction, 1e-7.
     """
     body, contacts, problem = indented(cell, 0.05, 1e-3)
     text = raised_everywhere(problem.solve, fc.NotConverged, "penetrates", "swapped", "side 0")
@@ -425,12 +425,12 @@ def test_a_narrow_indenter_does_not_pass(cell):
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("cells", [6, 12])
-def test_an_obstacle_may_be_that_of_several_contacts(kinematics, cells):
-    """Two slabs under a block that reaches over the edge of the second by 0.03.
+def test_obstacle_split_into_several_contacts(kinematics, cells):
+    """Two slabs are under a block that overlaps the edge of the second one by 0.03.
 
-    With facets of 0.2 no point is over the second slab, which then enters the block: refused, by a
-    contact for each slab as by one for both. With facets of 0.1 one is: the force is the same with
-    both, to what is solved for, 1e-8.
+    With facets of 0.2 no point is above the second slab, which penetrates the block: refused with a
+    contact for each slab and with one for both. With facets of 0.1 a point is, and both have the
+    same force, to the accuracy of the solution, 1e-8.
     """
     forces = []
     lines = [0.43 + np.linspace(0, 1.2, cells + 1), 0.5 + 0.2 * np.arange(4)]
@@ -464,8 +464,8 @@ def test_an_obstacle_may_be_that_of_several_contacts(kinematics, cells):
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_a_pin_in_a_hole_is_not_held_by_the_contact_around_it(kinematics):
-    """Flush with the slabs around, narrower than points of Γc are apart, and of a contact alone."""
+def test_undetected_pin_between_slabs_is_refused(kinematics):
+    """A pin level with the slabs, in its own contact and between points of Γc, is refused."""
     width, high = 0.04, np.linspace(0, 0.5, 3)
     edges = (0.0, 0.9), (1.1, 2.0), (1 - width / 2, 1 + width / 2)
     axes = [[np.linspace(*ends, n), high] for ends, n in zip(edges, (5, 5, 3), strict=True)]
@@ -489,8 +489,8 @@ def test_a_pin_in_a_hole_is_not_held_by_the_contact_around_it(kinematics):
     raised_everywhere(problem.solve, fc.NotConverged, "pin: the obstacle penetrates")
 
 
-def test_touching_is_no_penetration():
-    """Not before the gap is closed, and not by less than a fiftieth of the smaller facet, 5e-4."""
+def test_penetration_tolerance_of_the_verdict():
+    """Penetration fails once the gap is closed, above a fiftieth of the smaller facet, 5e-4."""
     for depth, fails in ((0.0, False), (9e-4, False), (1.4e-3, False), (1.6e-3, True)):
         *_, problem = indented("triangle", 0.05, depth, raised=1e-3)
         if fails:
@@ -502,8 +502,8 @@ def test_touching_is_no_penetration():
 @pytest.mark.each
 @pytest.mark.parametrize("counts", [(1, 20), (20, 1), (3, 20), (20, 3), (7, 8)])
 @pytest.mark.parametrize("swap", [False, True])
-def test_meshes_of_any_ratio_pass(counts, swap):
-    """Blocks pressed askew, so that they part on one side: nothing passes through unseen."""
+def test_any_ratio_of_mesh_sizes_is_verified(counts, swap):
+    """Blocks pressed eccentrically, so that one side opens: no undetected penetration."""
     body = stack("quadrilateral", counts, (0.5, 0.5), nu=0.3)
     body.hold(FLOOR, 0, 1)
     body.hold(ROOF, 0)
@@ -524,8 +524,8 @@ def test_meshes_of_any_ratio_pass(counts, swap):
 @pytest.mark.parametrize("counts", [(5, 9), (9, 5), (4, 40), (40, 4), (6, 6)])
 @pytest.mark.parametrize("swap", [False, True])
 @pytest.mark.parametrize("degree", [1, 2])
-def test_facets_of_curved_surfaces_are_no_penetration(counts, swap, degree):
-    """Rings of straight or curved cells, not loaded and pressed: chords overlap, and are borne."""
+def test_faceting_of_curved_surfaces_is_accepted(counts, swap, degree):
+    """Overlapping facets of rings of straight or curved cells pass the verdict, loaded or not."""
     body = rings(counts, degree=degree)
     body.hold(FLOOR, 0, 1)
     squeeze = body.constant(0.0)
@@ -544,10 +544,10 @@ def test_facets_of_curved_surfaces_are_no_penetration(counts, swap, degree):
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_true_gap(cell):
-    """The upper block turned by 0.3 and lifted: the distance along the turned normal to z = 0.5.
+def test_true_gap_of_a_rotated_block(cell):
+    """The upper block is rotated by 0.3 and lifted: distance along the rotated normal to z = 0.5.
 
-    To round-off; the pairs stay as they are.
+    The tolerance is round-off, 1e-12. The pairs are not updated.
     """
     body = stack(cell, (8, 4), (0.5, 0.25), widths=[3.0, 1.0])
     contact = joint(body, 1, fc.Frictionless(1e6))

@@ -1,7 +1,7 @@
-"""Several contacts at once: springs in series and in parallel, stacks, weights, sliding joints.
+"""Several contacts in a problem: springs in series and in parallel, stacks, sliding joints.
 
-References are closed answers or invariants. What is uniform is met to 1e-9 and what is solved for
-to 1e-8, as the solver's tolerance on the forces is 1e-9; sums of forces to 1e-12, round-off.
+References are closed-form solutions or invariants. The solver's tolerance on forces is 1e-9:
+uniform values are accurate to 1e-9, other solutions to 1e-8, sums of forces to round-off, 1e-12.
 """
 
 import numpy as np
@@ -35,8 +35,8 @@ pytestmark = [pytest.mark.three_ranks, pytest.mark.hexahedra]
 
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
-def test_three_blocks_on_a_floor(cell, degree):
-    """One pressure through three joints of unequal meshes and stiffness: springs in series."""
+def test_uniform_pressure_of_three_blocks_on_a_floor(cell, degree):
+    """Joints of different meshes and stiffnesses have the same pressure: springs in series."""
     q, stiffness, heights = 5e3, (1e7, 3e6, 2e7), (0.5, 0.25, 0.75)
     body = stack(cell, (3, 5, 4), heights, degree=degree)
     body.hold(SIDES, *range(body.d - 1))
@@ -58,8 +58,8 @@ def test_three_blocks_on_a_floor(cell, degree):
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
-def test_a_sheared_stack_that_friction_alone_holds(method):
-    """No Dirichlet condition at all: every joint carries the same force, though none evenly."""
+def test_sheared_stack_constrained_by_friction_alone(method):
+    """Without Dirichlet conditions all joints have the same force, 1e-8, and uneven pressures."""
     q, t = 5e3, 0.1 * 5e3
     body = stack("quadrilateral", (6, 9, 4), (0.3, 0.2, 0.3), nu=0.3)
     body.F += (q * body.v[1] - t * body.v[0]) * body.ds(ROOF)
@@ -69,7 +69,7 @@ def test_a_sheared_stack_that_friction_alone_holds(method):
     problem.solve()
     for contact in contacts:
         assert close(contact.resultants().force, [-t, q], 1e-8)
-        # Moment about the middle of the joint: the shear's lever is the height over it.
+        # Moment about the middle of the joint: the lever arm of the shear is the height above it.
         points = contact.gather()
         lever = points["measure"] * (points["x"][:, 0] - 0.5)
         moment = lever @ points["pressure"]
@@ -78,8 +78,8 @@ def test_a_sheared_stack_that_friction_alone_holds(method):
         assert np.ptp(points["pressure"]) > 0.1 * q
 
 
-def test_one_joint_fails_and_the_others_hold():
-    """Of joints with μ = 0.5, 0.1, 0.5 the middle one slips all over: it bears μN and no more."""
+def test_weakest_joint_slips_and_the_others_stick():
+    """Of joints with μ = 0.5, 0.1, 0.5 the middle one slips everywhere: all have T = 0.1 N."""
     body = stack("triangle", (6, 9, 4), (0.3, 0.2, 0.3), nu=0.3)
     q, push = 5e3, body.constant(0.0)
     body.F += q * body.v[1] * body.ds(ROOF)
@@ -95,8 +95,8 @@ def test_one_joint_fails_and_the_others_hold():
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_floor_and_wall(cell):
-    """A block in a corner under two pressures: Γc's share an edge, both are met exactly."""
+def test_block_between_floor_and_wall(cell):
+    """A block in a corner under two pressures: both contacts are exact, with an edge in common."""
     nu, q, side, k = 0.3, 3e3, 2e3, 1e7
     body = stack(cell, (4,), (1.0,), nu=nu, tags={WALL: near(0, 0), 9: near(0, 1)})
     up = body.d - 1
@@ -122,8 +122,8 @@ def test_floor_and_wall(cell):
     assert close(gathered(COMM, body.u.x.array[:n]), gathered(COMM, reference.x.array[:n]), 1e-8)
 
 
-def test_one_surface_on_a_body_and_on_a_rigid_obstacle():
-    """The same Γc against two obstacles: springs in parallel, one with a block in series."""
+def test_surface_with_a_body_and_a_rigid_obstacle():
+    """Contacts of Γc with two obstacles are springs in parallel, one with a block in series."""
     q, k_1, k_2 = 5e3, 1e7, 4e5
     body = stack("quadrilateral", (3, 5), (0.5, 0.5))
     body.hold(FLOOR, 1)
@@ -139,8 +139,8 @@ def test_one_surface_on_a_body_and_on_a_rigid_obstacle():
     assert uniform(rest.pressure, q * k_2 / (series + k_2))
 
 
-def test_both_ways_round():
-    """Each surface against the other, half the stiffness each: the pressure is shared evenly."""
+def test_symmetric_contacts_have_half_of_the_pressure_each():
+    """Each surface is Γc of a contact with half of the stiffness: each has half of the pressure."""
     q = 5e3
     body = stack("triangle", (3, 5), (0.5, 0.5))
     body.hold(FLOOR, 1)
@@ -158,8 +158,8 @@ def test_both_ways_round():
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_a_stack_under_a_weight(cell):
-    """Floor, two bodies, and a free rigid lid with a force on it: all three contacts carry it."""
+def test_stack_under_a_loaded_free_obstacle(cell):
+    """A floor, two bodies and a free obstacle: all contacts transfer the force on it, 1e-8."""
     body = stack(cell, (3, 4), (0.5, 0.5))
     up, k_n, weight = body.d - 1, 1e7, 5e3
     body.hold(SIDES, *range(up))
@@ -175,11 +175,10 @@ def test_a_stack_under_a_weight(cell):
 
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
-def test_a_bonded_stack(cell, degree):
-    """Elastic layers in two joints bear tension and shear: both are uniform, springs in series.
+def test_bonded_stack_in_tension_and_shear(cell, degree):
+    """Tension and shear of two elastic joints are uniform, 1e-9: springs in series.
 
-    Pure shear of a stack whose heights do not change and whose sides carry the shear that belongs
-    to it: u_x = t (z/G + the layers below over k_t).
+    The sides have the tractions of pure shear: u_x = t (z/G + the number of joints below / k_t).
     """
     q, t, k_n, k_t = 5e3, 2e3, 1e7, 4e6
     counts = (2, 3, 4) if cell == "hexahedron" else (3, 5, 4)
@@ -194,7 +193,7 @@ def test_a_bonded_stack(cell, degree):
     contacts = [joint(body, 1, law), joint(body, 2, law, swap=True)]
     body.problem(*contacts).solve()
     for contact, upward in zip(contacts, (False, True), strict=True):
-        # Γc of joint 1 is the bottom of the upper block, that of joint 2 the top of the lower one.
+        # Γc of joint 1 is the bottom of the upper block, Γc of joint 2 the top of the lower one.
         assert uniform(contact.pressure, -q)
         side = gathered(COMM, contact.tangential_traction)
         exact = np.zeros_like(side)
@@ -212,8 +211,8 @@ def test_a_bonded_stack(cell, degree):
 @pytest.mark.parametrize("swap", [False, True])
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
-def test_axisymmetric_discs(cell, degree, swap):
-    """Two discs of unequal meshes, weight 2πr down to the axis: uniform pressure, N = q π."""
+def test_uniform_pressure_of_axisymmetric_discs(cell, degree, swap):
+    """Two discs of different meshes with weight 2πr, up to the axis: uniform pressure, N = q π."""
     q, k_n = 5e3, 1e7
     body = stack(cell, (3, 5), (0.5, 0.5), degree=degree)
     r, u, v = body.x[0], body.u, body.v
@@ -231,8 +230,8 @@ def test_axisymmetric_discs(cell, degree, swap):
     assert np.abs(total).max() <= 1e-12 * size
 
 
-def test_one_joint_slides_far_and_another_holds():
-    """Pairs found anew in one joint alone, while that joint slides over three facets: T = μN."""
+def test_pairs_are_updated_only_in_the_sliding_joint():
+    """Pairs are updated in one joint alone, while it slides over three facets with T = μN, 1e-8."""
     q = 5e3
     body = stack("quadrilateral", (8, 16, 5), (0.3, 0.2, 0.2), widths=[1.0, 1.0, 0.4], nu=0.3)
     drag = body.constant(0.0)

@@ -1,7 +1,7 @@
 """One pair of surfaces: self-contact, interference, unequal and curved meshes, unpaired points.
 
-References are closed answers or invariants. What is uniform is met to 1e-9 and what is solved for
-to 1e-8, as the solver's tolerance on the forces is 1e-9; sums of forces to 1e-12, round-off.
+References are closed-form solutions or invariants. Solutions agree to 1e-8, as the solver's
+tolerance on forces is 1e-9; resultants cancel to 1e-12, round-off.
 """
 
 import numpy as np
@@ -22,9 +22,10 @@ pytestmark = pytest.mark.three_ranks
 
 
 def slit_ring(*, half, degree):
-    """A ring from 1 to 1.5, slit along x > 0 by 0.02; or its upper half. Clamped opposite the slit.
+    """Return a ring of radii 1 and 1.5 with a slit of 0.02 along x > 0, or its upper half.
 
-    FLOOR is the upper lip, ROOF the lower one (or the clamped cut of the half), SIDES the outside.
+    It is clamped opposite to the slit. FLOOR is the upper face of the slit, ROOF the lower one (or
+    the clamped cut of the half), SIDES the outer surface.
     """
     n = 24
     end = np.pi if half else 2 * np.pi
@@ -43,11 +44,11 @@ def slit_ring(*, half, degree):
 
 
 @pytest.mark.parametrize("degree", [1, 2])
-def test_a_slit_ring_closes(degree):
-    """Lips of one body against each other: as its half on a rigid plane of twice the stiffness.
+def test_self_contact_of_a_slit_ring_equals_its_half_on_a_plane(degree):
+    """Tractions of the slit faces are those of half the ring on a plane of twice the stiffness.
 
-    Both sink by half the jump. By symmetry the lips do not shear, so that friction, which the ring
-    has and the half has not, bears nothing.
+    Both have half the jump as penetration; forces agree to 1e-7, pressures to 1e-6. By symmetry the
+    faces do not shear, so that friction, which only the ring has, carries no force.
     """
     k_n, made, first = 1e7, [], []
     for half in (False, True):
@@ -77,8 +78,8 @@ def test_a_slit_ring_closes(degree):
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_interference(cell):
-    """A gap of -0.01 between blocks that are held: p = (0.01 - w)/(H/E + 1/k_n), and w opens it."""
+def test_interference_has_the_closed_form_pressure(cell):
+    """A gap of -0.01 between fixed blocks: p = (0.01 - w)/(H/E + 1/k_n) at opening w, to 1e-8."""
     k_n, oversize = 1e7, 0.01
     body = stack(cell, (3, 5), (0.5, 0.5))
     up = body.d - 1
@@ -101,7 +102,7 @@ def test_interference(cell):
 
 
 def test_interference_that_varies_along_the_joint():
-    """A gap by UFL, linear along the joint, between rigid blocks: the pressure is k_n times it."""
+    """A gap by UFL, linear along the joint, of undeformed blocks gives a pressure of -k_n gap."""
     body = stack("quadrilateral", (3, 5), (0.5, 0.5))
     contact = joint(body, 1, fc.Frictionless(1e7), gap=-0.01 * body.x[0])
     contact.evaluate()
@@ -109,7 +110,7 @@ def test_interference_that_varies_along_the_joint():
     assert close(points["pressure"], 1e5 * points["x"][:, 0], 1e-12)
 
 
-# ---- meshes that have nothing in common ----------------------------------------------------------
+# ---- very different meshes -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("swap", [False, True])
@@ -124,7 +125,7 @@ def test_interference_that_varies_along_the_joint():
     + [("hexahedron", 1, counts) for counts in ((1, 9), (9, 1), (8, 9))],
 )
 def test_patch_of_very_different_cells(counts, cell, degree, swap):
-    """One cell opposite twenty, either of them Γc; and cells that nearly match: still uniform."""
+    """Pressure is uniform, to 1e-8, for one cell opposite to 20 and for nearly matching cells."""
     nu, k_n = 0.3, 1e7
     body = stack(cell, counts, (0.05, 0.05), degree=degree, nu=nu)
     body.hold(FLOOR, body.d - 1)
@@ -144,13 +145,13 @@ def test_patch_of_very_different_cells(counts, cell, degree, swap):
 
 @pytest.mark.parametrize("swap", [False, True])
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
-def test_moment_of_a_gap(cell, swap):
-    """Equal forces on faces 0.02 apart: they cancel, and their moment is the shear times 0.02."""
+def test_moment_of_tractions_across_a_gap(cell, swap):
+    """Forces on faces 0.02 apart cancel; their moment is the shear force times 0.02, to 1e-10."""
     gap = 0.02
     body = stack(cell, (3, 5), (0.5, 0.5), apart=gap)
     contact = joint(body, 1, fc.Coulomb(0.3, k_n=1e6, k_t=1e6), swap=swap)
     up = body.d - 1
-    # The upper block moved down by more than the gap, and along.
+    # The upper block is moved down by more than the gap, and sideways.
     shape = np.zeros(body.d)
     shape[0], shape[-1] = 0.03, -0.06
 
@@ -166,22 +167,22 @@ def test_moment_of_a_gap(cell, swap):
     total, moment, size = balance(contact)
     assert np.abs(total).max() <= 1e-12 * size
     assert abs(r.force[0]) > 0.05 * size / 2
-    # On the body the shear, on the other one its opposite, a gap away.
+    # The shear forces on both bodies are opposite, at the distance of the gap.
     sign = 1 if swap else -1
     assert close(moment, sign * gap * r.force[0], 1e-10, scale=size * gap)
 
 
 def inner(x):
-    """Midpoints of the inner ring's cells."""
+    """Return which midpoints are of cells of the inner ring."""
     return np.linalg.norm(x, axis=1) < 20
 
 
 @pytest.mark.parametrize("counts", [(7, 11), (14, 23)])
-def test_turning_a_ring_in_a_ring(counts):
-    """The inner ring turned, an interference of 0.01: N = k_n δ R θ, torque = μ N R, all slips.
+def test_torque_of_a_ring_rotated_in_a_ring(counts):
+    """With an interference of 0.01 all points slip: N = k_n δ R θ, torque = μ N R, to 1e-5.
 
-    With a prescribed gap, length and normals of the arcs are all that the cells can miss: their
-    error is of the order (h/R)⁴, and that of 7 cells below 1e-5.
+    With a prescribed gap, the only errors are those of length and normals of the arcs, of the order
+    (h/R)⁴, below 1e-5 for 7 cells.
     """
     k_n, oversize, friction, angle = 1e5, 0.01, 0.2, 1.5
     law = fc.Coulomb(friction, k_n=k_n, k_t=1e6)
@@ -199,7 +200,7 @@ def test_turning_a_ring_in_a_ring(counts):
 
 
 def test_moments_of_curved_surfaces_cancel_as_the_meshes_are_refined():
-    """Forces cancel to round-off, moments up to the distance of the two meshes' arcs."""
+    """Forces cancel to round-off, moments up to the distance between the arcs of the two meshes."""
     errors = []
     for counts in ((4, 7), (8, 14), (16, 28)):
         body = rings(counts)
@@ -213,14 +214,14 @@ def test_moments_of_curved_surfaces_cancel_as_the_meshes_are_refined():
     assert errors[2] <= errors[0] / 16, "second order or better"
 
 
-# ---- points without an opposite ------------------------------------------------------------------
+# ---- unpaired points -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
-def test_overhang(cell):
-    """A slab on a narrower pillar: the points that look past it are counted, open, and free.
+def test_points_of_an_overhang_are_unpaired(cell):
+    """Points of a slab that overhangs a pillar are unpaired, open, and without traction.
 
-    What the pillar bears is the load, and its middle is the load's.
+    The contact force is the load, and its centre that of the load, to 1e-8.
     """
     q = 1e3
     body = stack(cell, (5, 8), (0.5, 0.25), widths=[0.6, 1.0], nu=0.3)
@@ -244,8 +245,8 @@ def test_overhang(cell):
     assert close(middle, 0.5 * q, 1e-8)
 
 
-def test_no_opposite_at_all():
-    """A body beside the other one: all of Γc is unpaired, and nothing acts."""
+def test_contact_without_opposite_points_has_no_force():
+    """If the bodies do not face each other, all points of Γc are unpaired, and forces are zero."""
     axes = [
         [np.linspace(0, 1, 4), np.linspace(0, 1, 4)],
         [np.linspace(2, 3, 4), np.linspace(1, 2, 4)],

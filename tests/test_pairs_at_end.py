@@ -1,7 +1,7 @@
-"""Two bodies at small displacements: forces act between the points opposite at an increment's end.
+"""Contact forces at small displacements act between the pairs at the end of an increment.
 
 A block is moved along a body, in one increment or in many. The references are statics, and the same
-block meshed where it ends.
+block meshed at its end position.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ WIDTH, HEIGHT = 0.5, 1.0
 
 
 class Led:
-    """A block that is led along a body below, and what is looked at of it.
+    """A block that is moved along a body below it.
 
     Attributes:
-        scene, along, contact, problem: As made.
+        scene, along, contact, problem: Scene, prescribed displacement, contact, and its problem.
     """
 
     def __init__(self, scene, along, contact, **options):
@@ -47,14 +47,14 @@ class Led:
         self.problem = scene.problem(contact, **options)
 
     def press(self):
-        """The first increment."""
+        """Solve and commit the first increment, with the block pressed down."""
         self.scene.keep_busy(0.5)
         self.problem.solve()
         self.problem.commit()
         return self
 
     def lead(self, way, steps=1):
-        """Move it on, in equal increments."""
+        """Move the block along the body, in equal increments."""
         self.scene.keep_busy(1.0)
         return list(fc.increments(self.problem, self.along, 0.0, way, steps=steps))
 
@@ -65,7 +65,7 @@ class Led:
 
 
 def on_cantilever(start, law=None, busy=(), *, load=-LOAD, clearance=0.0, **options):
-    """A block on a cantilever 10 long, loaded by a vertical traction, or held with a clearance."""
+    """Set up a block on a cantilever of length 10, with a vertical traction or a clearance."""
     boxes = {
         "beam": Box((0.0, 0.0), (10.0, HEIGHT), (80, 4)),
         "block": Box((start, HEIGHT + clearance), (WIDTH, 0.5), (6, 6)),
@@ -83,7 +83,7 @@ def on_cantilever(start, law=None, busy=(), *, load=-LOAD, clearance=0.0, **opti
 
 
 def moment(led):
-    """Moment of the reactions at the clamp about the origin: their work on a small rotation."""
+    """Return the moment of the clamp's reactions about the origin: their work on a rotation."""
     bodies, space = led.scene.bodies, led.scene.bodies.u.function_space
     rotation = fem.Function(space)
     rotation.interpolate(lambda x: np.array([-x[1], x[0]]))
@@ -97,9 +97,9 @@ def moment(led):
 
 
 def on_slab(start, law=None, busy=(), *, width=3.0, soft=1.0, spring=None, **options):
-    """A block on a slab, its top pressed down by 0.002; beyond x = 1.5 the slab may be softer.
+    """Set up a block on a slab that may be softer beyond x = 1.5; its top is lowered by 0.002.
 
-    It is led by its top, or by the end of a spring on it.
+    The horizontal displacement is prescribed at its top, or at the end of a spring on its top.
     """
     boxes = {
         "slab": Box((0.0, 0.0), (width, 0.5), (8 * round(width), 4)),
@@ -122,11 +122,11 @@ def on_slab(start, law=None, busy=(), *, width=3.0, soft=1.0, spring=None, **opt
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 @pytest.mark.parametrize("steps", [1, 7, 40])
-def test_a_load_moves_along_a_cantilever(steps, enforcement):
-    """The moment at the clamp is that of the load where it is, whatever the increments.
+def test_clamp_moment_of_a_load_sliding_on_a_cantilever(steps, enforcement):
+    """The moment at the clamp is that of the load at its end position, for any increments.
 
-    By statics, 1e-4: the pairs are those of a hundredth of a facet at most from the end, which is
-    1.6e-4 of the arm, and of points on both sides of it. It was 15 % of that in one increment.
+    Reference: statics, 1e-4. The pairs are those at most a hundredth of a facet from the end, or
+    1.6e-4 of the arm, on both sides of it. Those at the start would give 15 % of the moment.
     """
     led = on_cantilever(1.0, enforcement=enforcement).press()
     assert moment(led) == pytest.approx(LOAD * WIDTH * (1.0 + WIDTH / 2), rel=1e-6)
@@ -136,8 +136,8 @@ def test_a_load_moves_along_a_cantilever(steps, enforcement):
 
 
 @pytest.mark.parametrize("busy", BUSY)
-def test_beside_a_busy_body(busy):
-    """As alone, to 1e-6."""
+def test_slide_with_an_unrelated_body(busy):
+    """An unrelated body changes neither the moment nor the contact force, to 1e-6."""
     led = on_cantilever(1.0, fc.Coulomb(0.2)).press()
     led.lead(7.0)
     other = on_cantilever(1.0, fc.Coulomb(0.2), busy=[BUSY[busy]]).press()
@@ -148,11 +148,12 @@ def test_beside_a_busy_body(busy):
 
 @pytest.mark.parametrize("steps", [1, 10])
 @pytest.mark.parametrize("way", [0.5, 1.125, 1.625])
-def test_from_stiff_to_soft(way, steps):
-    """The slab is a hundredth as stiff beyond x = 1.5: the force of the block meshed at its end.
+def test_slide_from_stiff_to_soft_slab(way, steps):
+    """The block slides onto a part of the slab, x > 1.5, with a hundredth of the stiffness.
 
-    Where the nodes of both surfaces meet, so that the meshes of both scenes are the same, 2 %: the
-    normals are undeformed, and the block stands on an edge of stiffness.
+    Reference: the force of the block meshed at its end position, 2 %, as the normals are those of
+    the undeformed surface and the block stands across a step of the stiffness. The nodes of both
+    surfaces coincide there, so that both scenes have the same mesh.
     """
     led = on_slab(0.25, soft=1e-2).press()
     led.lead(way, steps)
@@ -161,16 +162,16 @@ def test_from_stiff_to_soft(way, steps):
 
 @pytest.mark.parametrize("gap", [None, 0.0])
 @pytest.mark.parametrize("steps", [1, 5, 40])
-def test_onto_a_slab(steps, gap):
-    """From an overhang of nine tenths to the middle: the force of the block meshed there, 0.5 %."""
+def test_slide_from_an_overhang_onto_the_slab(steps, gap):
+    """An overhanging block (7/8) is moved onto the slab: the force of one meshed there, 0.5 %."""
     options = {} if gap is None else {"gap": gap}
     led = on_slab(-0.875, **options).press()
     led.lead(1.25, steps)
     assert led.force == pytest.approx(on_slab(0.375).press().force, rel=5e-3)
 
 
-def test_what_is_solved_again():
-    """An increment solved twice, or after one that failed, is the one that is solved once."""
+def test_repeated_solves_give_the_same_solution():
+    """An increment solved twice, or after a failed solve, has the solution of a single solve."""
     once = on_slab(0.25, fc.Coulomb(0.3), soft=1e-2).press()
     once.along.value = 0.5
     once.problem.solve()
@@ -199,15 +200,15 @@ def test_what_is_solved_again():
 
 
 def solutions_of(step):
-    """How often an increment was solved between other points."""
+    """Return how many times an increment was solved, each time with other pairs."""
     return 1 + sum("solved again" in attempt.outcome for attempt in step.attempts)
 
 
 @pytest.mark.parametrize("spring", [None, 1e4])
-def test_points_are_those_where_the_last_increment_leads(spring):
-    """One solution for an increment that goes on as the last one, of the same size or another.
+def test_increments_with_predicted_pairs_need_one_solve(spring):
+    """An increment in the direction of the last one, of any size, is solved once.
 
-    Led by prescribed values, or pulled by a force; the forces are those of fewer increments.
+    Prescribed values or a spring move the block. Its force is that of fewer increments, 1e-3.
     """
 
     def make():
@@ -218,7 +219,7 @@ def test_points_are_those_where_the_last_increment_leads(spring):
         led.along.value = way
         numbers.append(solutions_of(led.problem.solve()))
         led.problem.commit()
-    # Pairs are of the undeformed bodies, then friction sets in, and the last turns round.
+    # First pairs are those of the undeformed bodies, then slip starts; the last one reverses.
     assert numbers[2:6] == [1] * 4
     assert 1 < numbers[6] < 5
     fewer = make()
@@ -230,9 +231,9 @@ def test_points_are_those_where_the_last_increment_leads(spring):
 
 
 def between_walls(law, ways, downs, start=0.5, *, loaded=False, **options):
-    """A block on a slab 4 long, pushed along by walls, each way in one increment.
+    """Push a block along a slab of length 4 by walls, one increment for each displacement.
 
-    Its top is led down, or loaded by a traction.
+    The vertical displacement of its top is prescribed, or a traction (``loaded``).
     """
     boxes = {
         "slab": Box((0.0, 0.0), (4.0, 0.5), (32, 4)),
@@ -265,11 +266,11 @@ def between_walls(law, ways, downs, start=0.5, *, loaded=False, **options):
 @pytest.mark.parametrize(
     ("law", "sign"), [(fc.Frictionless(), 1), (fc.Foundation(1e6), -1)], ids=["pressed", "pulled"]
 )
-def test_a_wrong_prediction_leaves_no_block_without_forces(law, sign):
-    """Walls turn the block round near the slab's end, while it is led down as before.
+def test_wrong_pair_prediction_keeps_contact_forces(law, sign):
+    """Walls reverse the block near the slab's end, while its top moves vertically as before.
 
-    So it is predicted beyond the end, where nothing opposes it. Reference: the block meshed where
-    it ends, 1e-3. The force was 0.
+    So the predicted position is beyond the end, without opposite points, where the force is 0.
+    Reference: the block meshed at its end position, 1e-3.
     """
     downs = -sign * np.linspace(2e-3, 2.4e-3, 5)
     found, _ = between_walls(law, (0.0, 0.3, 2.4, 2.3, 2.2), downs, gap=0.0)
@@ -277,10 +278,10 @@ def test_a_wrong_prediction_leaves_no_block_without_forces(law, sign):
     assert close(found[3], there[0], 1e-3)
 
 
-def test_a_failed_prediction_costs_one_method():
-    """A block that is predicted off the slab has no equilibrium there.
+def test_failed_pair_prediction_costs_one_attempt():
+    """A block has no equilibrium at its predicted position beyond the slab.
 
-    It is solved between its own points after one method, by 23 iterations. It took 604.
+    The committed pairs are used after one attempt: 23 iterations in total instead of 604.
     """
     _, steps = between_walls(
         fc.Coulomb(0.2), (0.0, 0.3, 2.3, 2.0), (-200.0, -210.0, -220.0, -230.0), loaded=True
@@ -290,10 +291,10 @@ def test_a_failed_prediction_costs_one_method():
 
 
 @pytest.mark.parametrize("law", [fc.Frictionless(), fc.Foundation(1e5)], ids=["bare", "springs"])
-def test_a_block_that_left_comes_back(law):
-    """Off the slab altogether, and back in one increment: the block meshed there, 2e-3.
+def test_block_leaves_the_slab_and_returns(law):
+    """The block leaves the slab and returns in one increment: that of one meshed there, 2e-3.
 
-    With a prescribed gap no distance tells that it is there again; the force was 0.
+    As the gap is prescribed, no distance indicates the return; an earlier version had no force.
     """
     led = on_slab(0.25, law, gap=0.0).press()
     for way in (0.2, 1.4, 3.6, 1.4):
@@ -306,8 +307,8 @@ def test_a_block_that_left_comes_back(law):
     assert led.force == pytest.approx(there.force, rel=2e-3)
 
 
-def test_held_while_an_unrelated_body_is_led_on():
-    """As alone, to 1e-6: what goes on elsewhere predicts nothing here. It differed by 1e-4."""
+def test_unrelated_body_does_not_change_predicted_pairs():
+    """A moving unrelated body changes the force of a resting block by 1e-6 at most, not by 1e-4."""
     forces = []
     for busy in ([], [BUSY["rubbed"]]):
         led = on_slab(0.25, fc.Coulomb(0.3), busy).press()
@@ -321,14 +322,14 @@ def test_held_while_an_unrelated_body_is_led_on():
 
 
 def state_of(led):
-    """Contact force of the committed state."""
+    """Return the contact force of the committed state."""
     led.problem.restore()
     return led.contact.resultants().force
 
 
 @pytest.mark.parametrize("field", ["every", "last"])
-def test_a_history_goes_on(field, tmp_path):
-    """Interrupted between increments that slide by some facets: the same digits, 1e-9."""
+def test_interrupted_history_continues(field, tmp_path):
+    """A history interrupted between increments of a few facets of slip has the same force, 1e-9."""
     path = COMM.bcast(tmp_path / "state")
     whole = on_slab(0.25, fc.Coulomb(0.3), soft=0.1).press()
     options = {"recover_interior": field}
@@ -354,8 +355,8 @@ def test_a_history_goes_on(field, tmp_path):
     assert close(*forces, 1e-9)
 
 
-def test_pairs_that_stay_are_refused_once_points_slide_over_facets():
-    """With update_pairs="never" forces stay where they were; said, unless the error is accepted."""
+def test_fixed_pairs_fail_beyond_a_facet_of_slip():
+    """With update_pairs="never" slip beyond a facet fails; if accepted, forces do not move."""
 
     def make():
         led = on_cantilever(1.0)
@@ -376,8 +377,8 @@ def test_pairs_that_stay_are_refused_once_points_slide_over_facets():
     assert moment(led) == pytest.approx(LOAD * WIDTH * (1.0 + WIDTH / 2), rel=1e-6)
 
 
-def test_one_contact_slides_and_another_stays():
-    """A second block stands still on the same beam: its pairs stay, and both loads count."""
+def test_resting_contact_keeps_its_pairs_while_another_slides():
+    """A second block rests on the beam: its pairs stay, and the first slips at μ p_n, 1e-6."""
     boxes = {
         "beam": Box((0.0, 0.0), (10.0, HEIGHT), (80, 4)),
         "one": Box((1.0, HEIGHT), (WIDTH, 0.5), (6, 6)),
@@ -415,7 +416,7 @@ class SmallSetup(SlidingSetup):
 
 
 def random_slide(seed):
-    """A frictionless block led on a slab, and the same one meshed where it ends."""
+    """Return the scenes of a frictionless block moved on a slab, and meshed at its end position."""
     left_out = ("rubber", "bend", "spin", "rock", "units", "restart", "method", "max_iterations")
     scene = sliding_scenes.draw(seed, without=left_out, family=seed // 24)
     body, contact = scene["bodies"][1], scene["contacts"][0]
@@ -438,10 +439,10 @@ def random_slide(seed):
 
 
 @pytest.mark.parametrize("seed", range(5120, 5360, 5))
-def test_random_slides(seed):
-    """The force of a block that is led is that of the block meshed where it ends.
+def test_force_after_random_slides(seed):
+    """The force of a moved block is that of the block meshed at its end position, to 2 %.
 
-    2 %: for strains of 1e-3, and facets that become covered where a block ends beside a node.
+    The tolerance is for strains of 1e-3, and for facets covered where a block ends near a node.
     """
     found = []
     for scene in random_slide(seed):
@@ -452,8 +453,8 @@ def test_random_slides(seed):
 
 
 @pytest.mark.parametrize("law", [fc.Foundation(1e5), Bond(1e5, 1.0)], ids=["foundation", "bond"])
-def test_in_tension(law):
-    """Forces that pull move along, too: the moment by statics, 1e-4. It was 15 % of that."""
+def test_tensile_forces_slide_with_the_block(law):
+    """Tensile forces move with the block: moment by statics, 1e-4 (15 % of it at the start)."""
     led = on_cantilever(1.0, law, load=LOAD, gap=0.0).press()
     led.lead(7.0)
     assert moment(led) == pytest.approx(-LOAD * WIDTH * (8.0 + WIDTH / 2), rel=1e-4)
@@ -461,9 +462,9 @@ def test_in_tension(law):
 
 @pytest.mark.parametrize("steps", [1, 10])
 def test_friction_without_pressure(steps):
-    """Tresca friction of a block that hovers: elongation of the cantilever by bar theory, 2 %.
+    """Tresca friction of a block with a clearance: elongation of the cantilever by bar theory, 2 %.
 
-    For the rest, the force stands by half of the height above the axis of the bar.
+    The difference is due to the eccentricity of the force, half of the height of the bar.
     """
     E = 1e5 / (1 - 0.3**2)
     led = on_cantilever(1.0, fc.Tresca(1.0, 1.0), clearance=0.01).press()
@@ -473,7 +474,7 @@ def test_friction_without_pressure(steps):
 
 
 def in_valley(kinematics, pushes):
-    """Displacements of a block pushed out of a shallow valley on a weak spring, (n_pushes,)."""
+    """Return displacements, (n_pushes,), of a block on a weak spring pushed out of a valley."""
     length, amplitude, width, sag = 4.0, 0.15, 0.6, 0.03
 
     def valley(x):
@@ -494,7 +495,7 @@ def in_valley(kinematics, pushes):
     scene.hold("low", BOTTOM, 0, 1)
     scene.load("block", TOP, 0, push)
     scene.load("block", TOP, 1, -2.0)
-    # A weak spring along, and one that keeps the top from turning.
+    # A weak horizontal spring, and one against rotation of the top.
     bodies.F += 0.02 * bodies.u[0] * bodies.v[0] * top
     bodies.F += 1e3 * bodies.u[1].dx(0) * bodies.v[1].dx(0) * top
     obstacle = fc.DeformableBody(bodies.tags, scene.tag("block", BOTTOM), update_pairs="increment")
@@ -510,11 +511,11 @@ def in_valley(kinematics, pushes):
     return np.array(ways)
 
 
-def test_pushed_along_a_curved_surface():
-    """The iteration for the pairs overshoots there: relaxed it ends near finite kinematics.
+def test_pair_iteration_is_relaxed_on_a_curved_surface():
+    """The iteration for the pairs overshoots; with relaxation it ends near finite kinematics.
 
-    3 % of the way: pairs are to a hundredth of a facet, 2 % of it, and slopes those at rest. Not
-    relaxed, an increment in which it went against the push by 0.026 was verified.
+    3 % of the displacement: pairs are accurate to a hundredth of a facet, 2 % of it, and slopes are
+    undeformed. Without relaxation, an increment with 0.026 against the push was verified.
     """
     pushes = [0.005, 0.01, 0.015, 0.02]
     expected = in_valley("finite", pushes)
@@ -523,8 +524,8 @@ def test_pushed_along_a_curved_surface():
     assert np.abs(found - expected).max() < 0.03 * expected[-1]
 
 
-def test_a_trial_is_kept_by_an_increment_that_fails():
-    """Its interior may be found after an increment that was solved between other pairs failed."""
+def test_failed_increment_keeps_the_trial_state():
+    """The interior of a trial state can be recovered after an increment with other pairs failed."""
     boxes = {
         "slab": Box((0.0, 0.0), (3.0, 0.5), (24, 4)),
         "block": Box((0.25, 0.5), (1.0, 0.5), (8, 4)),
@@ -547,10 +548,10 @@ def test_a_trial_is_kept_by_an_increment_that_fails():
     assert problem.solve().verdict.failures == []
 
 
-def test_contact_that_moves_beyond_the_retained_unknowns():
-    """Static condensation onto some of Γc, in space: a slide far beyond these, as on all unknowns.
+def test_contact_slides_beyond_the_retained_dofs():
+    """Static condensation onto a part of Γc in 3D: a slide far beyond it has the same force.
 
-    To the tolerance of the pairs, 1e-4.
+    Reference: without condensation, to the tolerance of the pairs, 1e-4.
     """
     forces = []
     for condensation in (True, False):
@@ -570,11 +571,11 @@ def test_contact_that_moves_beyond_the_retained_unknowns():
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 @pytest.mark.parametrize("way", [0.6, 1.0, 1.25, 1.5])
-def test_slides_over_many_facets_are_not_taken_for_crossing(way, enforcement):
-    """Nodes that a block leaves behind come up in front of it, not inside of it.
+def test_slides_over_many_facets_are_not_tunnelling(way, enforcement):
+    """Nodes of the slab that the block leaves behind end in front of its face, not inside of it.
 
-    Their straight paths come in through its bottom and leave it where no facets are: 28 of 64
-    slides were refused.
+    Their straight paths enter it through its bottom and leave it where Γc has no facets: an earlier
+    version refused 28 of 64 slides.
     """
     led = on_slab(0.25, fc.Coulomb(0.3), enforcement=enforcement).press()
     led.along.value = way

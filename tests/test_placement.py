@@ -1,4 +1,4 @@
-"""Obstacles: gap and normal at the points of Γc against formulas in numpy."""
+"""Gap and normal of obstacles at the points of Γc, against formulas in numpy."""
 
 import logging
 
@@ -16,8 +16,8 @@ from scenes.elasticity import displacement_space
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
 
-# Gap and normal are a handful of operations on coordinates of size one, evaluated by a quotient of
-# assembled sums: round-off is some 1e-15, and 1e-12 leaves room for the sums alone.
+# Gap and normal are a few operations on coordinates of size one, evaluated as a quotient of
+# assembled sums: round-off is about 1e-15, and 1e-12 leaves a margin for the sums.
 EXACT = 1e-12
 
 CELL = {2: "triangle", 3: "tetrahedron"}
@@ -58,13 +58,13 @@ def cylinder(x, shift, point, radius, inside, axis=None):
 
 
 def check(contact: fc.Contact, reference, shift=0.0) -> None:
-    """Gap, normal and normal displacement, all points of all ranks together."""
+    """Check gap, normal and initial gap at all points of all ranks against the reference."""
     contact.evaluate()
     x = gathered(COMM, contact.points)
     gap, normal = reference(x, shift)
     assert close(gathered(COMM, contact.values.initial_gap), gap, EXACT, scale=1.0)
     assert close(gathered(COMM, contact.values.normal), normal, EXACT, scale=1.0)
-    # u = 0 here, so that what is open is the initial gap (eq. 6).
+    # With u = 0 the gap is the initial gap (eq. 6).
     assert close(gathered(COMM, contact.gap), gap, EXACT, scale=1.0)
 
 
@@ -102,7 +102,7 @@ def obstacles(d: int) -> dict:
 @pytest.mark.parametrize("kind", obstacles(2))
 @pytest.mark.parametrize("d", [2, 3])
 def test_gap_and_normal(d, kind):
-    """Gap and normal of every obstacle, at rest and displaced by a tuple."""
+    """Gap and normal of every obstacle match formulas, at rest and displaced by a tuple."""
     make, reference = obstacles(d)[kind]
     surface, u = scene(d)
     law = fc.Frictionless(k_n=1.0)
@@ -110,7 +110,7 @@ def test_gap_and_normal(d, kind):
     shift = np.array(SHIFT[d])
     moved = fc.Contact(u, surface, make(SHIFT[d]), law)
     check(moved, reference, shift)
-    # The displacement given by numbers is a parameter: a new value moves the obstacle.
+    # A displacement given by numbers is a parameter: a new value moves the obstacle.
     moved.parameters["displacement"].value[:] = -2 * shift
     check(moved, reference, -2 * shift)
 
@@ -131,7 +131,7 @@ def test_displacement_by_a_constant(d, kind):
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_obstacle_by_ufl(d):
-    """A gap and a normal of any length given by UFL are taken as they are, the normal made unit."""
+    """A gap given by UFL is used unchanged, a normal of any length is normalised."""
     surface, u = scene(d)
     x = ufl.SpatialCoordinate(surface.mesh)
     normal = ufl.as_vector([0.3 * x[0], *([x[0] * x[1]] if d == 3 else []), -4.0 - x[0]])
@@ -165,14 +165,14 @@ def test_obstacle_by_a_function(d):
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("kind", ["half-space", "ball", "cylinder"])
 def test_prescribed_gap_does_not_depend_on_the_geometry(d, kind):
-    """``gap=`` replaces the distance (paper, footnote 1); the obstacle's motion along n adds."""
+    """``gap=`` replaces the distance (paper, footnote 1); motion of the obstacle along n adds."""
     make, reference = obstacles(d)[kind]
     surface, u = scene(d)
     motion = fem.Constant(surface.mesh, np.zeros(d))
     contact = fc.Contact(u, surface, make(motion), fc.Frictionless(k_n=1.0), gap=0.07)
 
     def prescribed(value):
-        # The normal is that of the geometry, the gap is not.
+        # The normal is that of the geometry; the gap is prescribed.
         def expected(x, shift):
             normal = reference(x, shift)[1]
             return value + normal @ np.broadcast_to(shift, d), normal
@@ -200,8 +200,8 @@ def test_length_of_the_normal_does_not_matter(d):
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_rigid_motion_of_body_and_obstacle_together(d):
-    """Body and obstacle moved alike: same gap, no tangential jump, up to round-off."""
+def test_common_translation_changes_no_gap(d):
+    """A common translation of body and obstacle changes neither gap nor tangential jump, 1e-12."""
     surface, u = scene(d)
     shift = np.array(SHIFT[d])
     obstacle = fc.HalfSpace(POINT[d], SLOPE[d], displacement=SHIFT[d])
@@ -214,11 +214,11 @@ def test_rigid_motion_of_body_and_obstacle_together(d):
     assert close(jump, 0 * jump, EXACT, scale=1.0)
 
 
-def test_a_body_that_starts_inside_its_obstacle_is_reported(caplog):
-    """The largest initial penetration is on the problem, and in one warning on rank 0 alone.
+def test_initial_penetration_is_reported(caplog):
+    """The problem has the largest initial penetration, and rank 0 alone logs one warning.
 
-    Reference: a disc of radius 2 whose top lies 0.125 above the bottom: deepest at the point
-    nearest to its axis, R - |x - c|. Tolerance: round-off.
+    Reference: R - |x - c|, the penetration at the point nearest to the axis of a disc of radius 2
+    whose top is 0.125 above the bottom. Tolerance: round-off.
     """
     scene = block("quadrilateral")
     disc = fc.Ball((0.5, 0.125 - 2.0), 2.0)
@@ -237,8 +237,8 @@ def test_a_body_that_starts_inside_its_obstacle_is_reported(caplog):
     assert not any(texts[1:])
 
 
-def test_a_body_that_touches_does_not_penetrate(caplog):
-    """A gap of zero or more is no initial penetration, and nothing is logged."""
+def test_touching_body_has_no_initial_penetration(caplog):
+    """Without negative gaps the initial penetration is zero, and nothing is logged."""
     scene = block("quadrilateral")
     with caplog.at_level(logging.WARNING, logger="fenics_contact"):
         problem, _ = scene.problem(fc.Frictionless(k_n=1e3), scene.rollers())
@@ -271,8 +271,8 @@ def test_a_body_that_touches_does_not_penetrate(caplog):
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, fc.Obstacle) else None,
 )
-def test_bad_obstacle_in_the_plane(obstacle, words):
-    """Data of the wrong dimension, without length or not finite: the message names them."""
+def test_bad_obstacle_in_the_plane_is_refused(obstacle, words):
+    """The error names data of the wrong dimension, of length zero, or not finite."""
     surface, u = scene(2)
     raised_everywhere(
         lambda: fc.Contact(u, surface, obstacle, fc.Frictionless(k_n=1.0)), ValueError, *words
@@ -289,16 +289,16 @@ def test_bad_obstacle_in_the_plane(obstacle, words):
         (fc.Ball((0, 0), 1.0), ("center",)),
     ],
 )
-def test_bad_obstacle_in_space(obstacle, words):
-    """As in the plane, and the axis of a cylinder is needed."""
+def test_bad_obstacle_in_space_is_refused(obstacle, words):
+    """The error names data of the wrong dimension, and a missing or zero axis of a cylinder."""
     surface, u = scene(3)
     raised_everywhere(
         lambda: fc.Contact(u, surface, obstacle, fc.Frictionless(k_n=1.0)), ValueError, *words
     )
 
 
-def test_friction_feels_the_displacement_alone():
-    """A floor raised and drawn along: in a gap or a point what is along Γc is felt by nothing."""
+def test_only_displacement_of_an_obstacle_causes_friction():
+    """Motion along Γc by ``displacement`` causes friction; by point or gap it does not."""
     force = {}
     for way in ("displacement", "point", "gap"):
         made = block("quadrilateral", n=4)

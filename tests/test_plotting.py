@@ -1,4 +1,4 @@
-"""Pictures without a screen: what is drawn, taken from the figure that is about to be saved."""
+"""Tests of pictures, without a screen, by the contents of the figures that are saved."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ CORNERS = {"triangle": 3, "quadrilateral": 4, "tetrahedron": 3, "hexahedron": 4}
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The figures, kept open."""
+    """Return the list of saved figures, which remain open."""
     figures, save = [], drawing.save
 
     def keep(figure, path):
@@ -35,8 +35,11 @@ def drawn(monkeypatch):
 
 
 @pytest.mark.parametrize("cell", CELLS)
-def test_pictures_of_any_body(cell, tmp_path, drawn):
-    """Whole on any number of ranks: every facet once, its colour and place; axes with units."""
+def test_pictures_of_pressure_status_and_deformation(cell, tmp_path, drawn):
+    """Every facet is drawn once on any number of ranks, at its place and in its colour.
+
+    Axes have units, and displacements are magnified.
+    """
     folder, d = shared_folder(tmp_path), dimension(cell)
     made = Rub(cell=cell, mesh={"n": 4})
     made.problem.small_displacement_tolerance = np.inf
@@ -56,9 +59,9 @@ def test_pictures_of_any_body(cell, tmp_path, drawn):
             assert axes.get_xlabel() == "x [m]" and axes.get_ylabel() == "y [m]"
         assert pressure.axes[1].get_ylabel() == "contact pressure [Pa]"
         assert pressure.axes[0].get_title() == "Title"
-        body, *_, surface = pressure.axes[0].collections  # in the plane the obstacle between them
+        body, *_, surface = pressure.axes[0].collections  # the obstacle in between in the plane
         assert len(shapes(body)) == n_shapes and len(shapes(surface)) == n_facets
-        # The colour scale goes up to the largest mean, and as many facets as bear are coloured.
+        # The colour scale ends at the largest mean, and all loaded facets are coloured.
         by_facet = per_facet(points, cell)
         assert close(pressure.axes[1].get_ylim(), [0.0, by_facet.max()], 1e-12)
         colours = surface.get_facecolor() if d == 3 else surface.get_color()
@@ -67,7 +70,7 @@ def test_pictures_of_any_body(cell, tmp_path, drawn):
         assert np.count_nonzero(bears) == np.count_nonzero(by_facet > 0)
         names = [text.get_text() for text in status.legends[0].get_texts()]
         assert names == ["open", "sticking", "slipping", *["rigid obstacle"] * (d == 2)]
-        # Displacements by twice their size: the top moves by 0.1 along and 0.03 down.
+        # Displacements are magnified by 2: the top moves by 0.1 along x and 0.03 down.
         before, after = (np.concatenate(shapes(c)) for c in deformed.axes[0].collections)
         assert close(before.max(axis=0)[: d - 1], np.ones(d - 1), 1e-12)
         assert close([after[:, 0].max()], [1.2], 1e-9)
@@ -75,7 +78,7 @@ def test_pictures_of_any_body(cell, tmp_path, drawn):
         outline = shapes(deformed.axes[0].collections[0])
         if d == 2:
             assert len(outline[0]) in (CORNERS[cell], CORNERS[cell] + 1)
-        else:  # the twelve edges of the cube, of four facets each
+        else:  # the twelve edges of the cube, each of four segments
             assert len(outline) == 48 and all(len(ends) == 2 for ends in outline)
         for name in ("p.png", "s.png", "d.png"):
             assert (folder / name).read_bytes()[:4] == b"\x89PNG"
@@ -85,10 +88,10 @@ def test_pictures_of_any_body(cell, tmp_path, drawn):
 
 
 @pytest.mark.parametrize("cell", CELLS)
-def test_fields_and_stress(cell, tmp_path, drawn):
-    """Means of the facets and values at the points, as `gather` has them; von Mises in closed form.
+def test_pictures_of_fields_and_stress(cell, tmp_path, drawn):
+    """Facet means and point values agree with `gather`, von Mises stresses with a closed form.
 
-    The stress is that of a stretch along x that grows with x: E ε, where E is along x alone.
+    The stress is E ε along x, where the strain ε is proportional to x.
     """
     folder, d = shared_folder(tmp_path), dimension(cell)
     made = Rub(cell=cell, mesh={"n": 4})
@@ -134,7 +137,7 @@ def test_fields_and_stress(cell, tmp_path, drawn):
                 assert len(x) > 2 and x.min() >= 0 and x.max() <= 1
                 near = (points["x"][:, 0] >= x.min()) & (points["x"][:, 0] <= x.max())
                 assert np.array_equal(np.sort(y), np.sort(points[name][near]))
-        # In the middle of the last cells along x, and colours from yellow to the largest.
+        # The colour scale ends at the stress in the midpoints of the last cells along x.
         body = drawn[-1].axes[0].collections[1]
         largest = {"triangle": 11 / 12, "tetrahedron": 15 / 16}.get(cell, 7 / 8)
         assert close(drawn[-1].axes[1].get_ylim(), [0, 100 * largest], 1e-9)
@@ -144,12 +147,12 @@ def test_fields_and_stress(cell, tmp_path, drawn):
 
 
 def entries(figure):
-    """What the legends of a figure say."""
+    """Return the texts in the legends of a figure."""
     return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
 
 
 def shapes(collection):
-    """Corners of what is in a collection, as given."""
+    """Return the corners of each shape of a collection, in the order given."""
     if hasattr(collection, "_segments3d"):
         return [np.asarray(ends) for ends in collection._segments3d]
     if hasattr(collection, "_faces"):  # in space; some releases have both
@@ -160,7 +163,7 @@ def shapes(collection):
 
 
 def per_facet(points, cell):
-    """Mean pressure by facets of a grid of four a side, triangles by their halves."""
+    """Return the mean pressure of each facet of a grid of four per side, halved into triangles."""
     x = points["x"][:, :-1]
     number = np.floor(4 * x).astype(int) @ [1, 4][: x.shape[1]]
     if cell == "tetrahedron":
@@ -170,8 +173,8 @@ def per_facet(points, cell):
     return sums / np.bincount(number, points["measure"])
 
 
-def test_wrong_folder(tmp_path):
-    """The first rank's error, and no picture."""
+def test_missing_folder_is_refused(tmp_path):
+    """All ranks raise the error of the first rank, without a picture."""
     made = Rub()
     path = shared_folder(tmp_path) / "no" / "p.png"
     for call in (
@@ -181,8 +184,8 @@ def test_wrong_folder(tmp_path):
         raised_everywhere(call, OSError, "no")
 
 
-def test_what_is_no_displacement(tmp_path):
-    """It is said, not left to DOLFINx."""
+def test_wrong_displacements_are_refused(tmp_path):
+    """The error is raised by the package, not by DOLFINx."""
     u = Rub().scene.u
     scalar = fem.Function(fem.functionspace(u.function_space.mesh, ("Lagrange", 1)))
     path = shared_folder(tmp_path) / "u.png"
@@ -193,8 +196,8 @@ def test_what_is_no_displacement(tmp_path):
 
 
 @pytest.mark.parametrize("cell", CELLS)
-def test_only_what_is_near_the_contact(cell, tmp_path, drawn):
-    """All facets that bear are drawn, and none farther from them than asked for; or all of them."""
+def test_near_restricts_pictures_to_the_contact(cell, tmp_path, drawn):
+    """All loaded facets are drawn, and nothing beyond ``near`` of them, unless it is None."""
     folder, d = shared_folder(tmp_path), dimension(cell)
     made = Rub(cell=cell, mesh={"n": 8 if d == 2 else 4})
     made.problem.small_displacement_tolerance = np.inf
@@ -219,7 +222,7 @@ def test_only_what_is_near_the_contact(cell, tmp_path, drawn):
         for figure in drawn[:2]:
             body, *_, surface = figure.axes[0].collections
             bearing = np.concatenate(shapes(surface))
-            n = CORNERS[cell]  # of a closed path the first comes twice
+            n = CORNERS[cell]  # a closed path repeats the first
             middles = np.array([np.mean(shape[:n], axis=0) for shape in shapes(body)])
             middles = middles.reshape(-1, d)
             low, high = bearing.min(axis=0) - reach, bearing.max(axis=0) + reach

@@ -1,7 +1,7 @@
-"""Two bodies that deform and slide far: pairs at the present places, their forces and tangent.
+"""Finite sliding of two deformable bodies: pairs at deformed positions, forces and tangent.
 
-`kinematics="finite"` with a `DeformableBody`. Displacements of the first tests are made up: random
-nodes, so that nothing is symmetric, on bodies that have turned by a large angle.
+`kinematics="finite"` with a `DeformableBody`. The first tests prescribe displacements: perturbed
+nodal positions, so that nothing is symmetric, on bodies rotated by a large angle.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ LAWS = {
 
 
 class Pair:
-    """A small block on a larger one, their meshes do not match; displacements are written at will.
+    """A small block on a larger one with non-matching meshes; displacements are prescribed.
 
     Attributes:
-        mesh, tags, u, contact: As made.
+        mesh, tags, u, contact: Mesh, facet tags, displacement and contact.
         d: Dimension of space.
     """
 
@@ -55,7 +55,7 @@ class Pair:
         like: Pair | None = None,
         **options,
     ) -> None:
-        """Make them, or take the mesh of others: of two that are equal ranks may get other parts.
+        """Create the blocks, or use the mesh of `like`: a new mesh may be partitioned differently.
 
         Collective.
         """
@@ -70,22 +70,22 @@ class Pair:
 
     @property
     def nodes(self) -> np.ndarray:
-        """Their places, ghosts included, (n, d)."""
+        """Undeformed positions of the nodes, ghosts included, (n, d)."""
         return self.u.function_space.tabulate_dof_coordinates()[:, : self.d]
 
     def place(self, x: np.ndarray) -> None:
-        """Let nodes be at x, (n, d)."""
+        """Set u such that the deformed positions of the nodes are x, (n, d)."""
         self.u.x.array[:] = (x - self.nodes).ravel()
         self.u.x.scatter_forward()
 
     def wobbled(self, size: float, seed: int) -> np.ndarray:
-        """Places off the nodes' by waves of a size, the same on any number of ranks, (n, d)."""
+        """Return nodal positions perturbed by sine waves, equal on any number of ranks, (n, d)."""
         rng = np.random.default_rng(seed)
         k, phase = rng.uniform(3, 9, (self.d, self.d)), rng.uniform(0, 6, self.d)
         return self.nodes + size * np.sin(self.nodes @ k.T + phase)
 
     def pressed(self, x: np.ndarray, down: float, along: float) -> np.ndarray:
-        """The upper body of places x, moved."""
+        """Return the positions x with those of the upper body translated."""
         upper = np.zeros(len(x), dtype=bool)
         space = self.u.function_space
         middles = dolfinx.mesh.compute_midpoints(
@@ -98,7 +98,7 @@ class Pair:
         return moved
 
     def force(self) -> np.ndarray:
-        """Contact's part of the residual at this rank's unknowns. Collective."""
+        """Return the contact part of the residual at the dofs of this rank. Collective."""
         self.contact.contact_kinematics.update()
         operator = ContactOperator(self.contact)
         vector = operator.unknowns.vector()
@@ -108,7 +108,7 @@ class Pair:
 
 
 def turn(d: int, angle: float) -> np.ndarray:
-    """Matrix of a turn, in space about an axis across all coordinates'."""
+    """Return a rotation matrix, in 3D about an axis oblique to all coordinate axes."""
     if d == 2:
         c, s = np.cos(angle), np.sin(angle)
         return np.array([[c, -s], [s, c]])
@@ -118,7 +118,7 @@ def turn(d: int, angle: float) -> np.ndarray:
 
 
 def loaded(pair: Pair, along: float) -> None:
-    """Commit a state on turned bodies, then press and shear further."""
+    """Commit a state of rotated bodies, then rotate, press and shear them further."""
     d = pair.d
     pair.place(pair.pressed(pair.wobbled(0.01, 1), 0.04, 0.0) @ turn(d, 0.7).T)
     pair.contact.commit()
@@ -129,8 +129,8 @@ def loaded(pair: Pair, along: float) -> None:
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("along", [0.004, 0.08])
 @pytest.mark.parametrize(("cell", "degree"), [*((c, 1) for c in CELLS), ("triangle", 2)])
-def test_the_tangent_is_the_derivative_of_the_forces(cell, degree, along, law):
-    """By central differences, to 1e-6 of the largest entry: steps are 1e-6 of the size."""
+def test_tangent_is_the_derivative_of_the_forces(cell, degree, along, law):
+    """Central differences with steps of 1e-6 give the tangent to 1e-6 of the largest entry."""
     pair = Pair(cell, LAWS[law], degree=degree, kinematics="finite")
     loaded(pair, along)
     pair.contact.evaluate()
@@ -152,8 +152,8 @@ def test_the_tangent_is_the_derivative_of_the_forces(cell, degree, along, law):
     assert np.abs(slope - product.array_r).max(initial=0.0) <= 1e-6 * size
 
 
-def test_points_of_the_derivatives_stick_and_slip():
-    """What the differences above go through: both, in one state or the other."""
+def test_states_of_the_tangent_test_have_slip_and_stick():
+    """The two states of the tangent test include sticking and slipping points."""
     found = set()
     for along in (0.004, 0.08):
         pair = Pair("triangle", LAWS["coulomb"], kinematics="finite")
@@ -165,8 +165,8 @@ def test_points_of_the_derivatives_stick_and_slip():
 
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron"])
-def test_turned_bodies_have_turned_forces(cell):
-    """A rotation of everything after the commit, about the normal too: 1e-10 of the forces."""
+def test_contact_forces_are_frame_invariant(cell):
+    """Forces rotate with both bodies after the commit, to 1e-10, also if about the normal."""
     forces, pair = [], None
     for angle in (0.0, 0.9, -2.5):
         pair = Pair(cell, LAWS["coulomb"], like=pair, kinematics="finite")
@@ -182,7 +182,7 @@ def test_turned_bodies_have_turned_forces(cell):
 
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
 def test_forces_on_both_bodies_cancel(cell):
-    """Their sum is round-off, and their moment the one that tractions have over a gap: small."""
+    """The resultant is round-off; the moment is at most gap times tangential traction, summed."""
     pair = Pair(cell, LAWS["coulomb"], kinematics="finite")
     loaded(pair, 0.08)
     force = pair.force().reshape(-1, pair.d)
@@ -199,8 +199,8 @@ def test_forces_on_both_bodies_cancel(cell):
     assert abs(moment) <= torque + 1e-13 * size
 
 
-def test_small_displacements_are_the_limit():
-    """Matching meshes: the difference to small kinematics falls with the square of the size."""
+def test_small_kinematics_are_the_limit_of_finite_kinematics():
+    """On matching meshes the relative difference of the forces falls in proportion to the size."""
     errors, pair = [], None
     for size in (1e-3, 1e-4):
         tractions = []
@@ -214,10 +214,10 @@ def test_small_displacements_are_the_limit():
 
 
 class Blocks:
-    """Two neo-Hookean blocks, the upper one's top moved and turned.
+    """Two neo-Hookean blocks; the top of the upper one has a prescribed displacement.
 
     Attributes:
-        contact, problem, u: As made.
+        contact, problem, u: Contact, problem and displacement.
     """
 
     def __init__(
@@ -230,7 +230,7 @@ class Blocks:
         angle: float = 0.0,
         **options,
     ) -> None:
-        """Make them, unloaded: with lengths times size, and turned. Collective."""
+        """Create the unloaded blocks, scaled by size and rotated by angle. Collective."""
         widths, shift = ((2.0, 1.0), 0.3) if n[0] != n[1] else ((1.0, 1.0), 0.0)
         self.mesh, tags = two_blocks(cell, n, widths, shift)
         x, d = self.mesh.geometry.x, self.mesh.geometry.dim
@@ -253,12 +253,12 @@ class Blocks:
         self.problem = fc.ContactProblem(body.residual(v), self.u, bcs=bcs, contacts=[self.contact])
 
     def load(self, t: float) -> None:
-        """Down while t < 1, then along."""
+        """Press the top down while t < 1, then drag it sideways."""
         self.top[-1].value = -0.05 * min(t, 1.0)
         self.top[0].value = 0.6 * max(t - 1.0, 0.0)
 
     def history(self, until: float, steps, **options) -> list[fc.Step]:
-        """Solve and commit. Collective."""
+        """Solve and commit all increments. Collective."""
         return list(fc.increments(self.problem, self.load, 0.0, until, steps=steps, **options))
 
 
@@ -266,23 +266,23 @@ WAY = [0.5, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0]
 
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
-def test_a_block_slides_far(enforcement):
-    """Over three facets: T = mu N on the deformed slope, energy given to friction, all verified."""
+def test_block_slides_over_several_facets(enforcement):
+    """Sliding over three facets: T = μ N to 1e-9 (augmented 1e-4), dissipation μ N w to 10 %."""
     blocks = Blocks("triangle", fc.Coulomb(0.2), (6, 4), enforcement=enforcement)
     steps = blocks.history(2.0, WAY)
     force = steps[-1].contacts["contact"]
     assert force.slip > 0 and force.stick == 0
-    # On the block itself: tractions along and across the present normals are in the cone.
+    # Resultants along and across the present normals: the tractions are on the friction cone.
     ratio = force.tangential_force / force.normal_force
     assert ratio == pytest.approx(0.2, rel=1e-9 if enforcement == "penalty" else 1e-4)
     taken = sum(step.energy.dissipation for step in steps[2:])
     assert taken == pytest.approx(0.6 * 0.2 * force.normal_force, rel=0.1)  # N is nearly constant
 
 
-def test_sliding_takes_few_steps_forth_and_back():
-    """A start in which those points slip that did: 34 and 31 steps, 53 and 38 if all stick in it.
+def test_sliding_and_load_reversal_take_few_newton_steps():
+    """A predictor with the points that slipped before needs 34 and 31 steps; with stick 53 and 38.
 
-    Way back included, at whose first increment all points stick again and no start slips.
+    In the first increment after the load reversal all points stick, and so does the predictor.
     """
     blocks = Blocks("triangle", fc.Coulomb(0.3), (12, 6))
     forth = [step.iterations for step in blocks.history(2.0, WAY)]
@@ -291,8 +291,8 @@ def test_sliding_takes_few_steps_forth_and_back():
     assert sum(forth) <= 40 and sum(back) <= 34 and back[0] <= 4
 
 
-def test_a_history_goes_on_where_it_stopped(tmp_path):
-    """Resumed from a checkpoint it has the digits of one without a stop."""
+def test_resumed_history_equals_the_uninterrupted_one(tmp_path):
+    """Contact forces of a history resumed from a checkpoint are those without a stop, to 1e-9."""
     path = MPI.COMM_WORLD.bcast(tmp_path) / "state"
     whole = Blocks("triangle", fc.Coulomb(0.2), (6, 4))
     steps = whole.history(2.0, WAY)
@@ -308,8 +308,8 @@ def test_a_history_goes_on_where_it_stopped(tmp_path):
         np.testing.assert_allclose(mine.force, theirs.force, rtol=1e-9)
 
 
-def test_a_turned_patch_bears_a_uniform_pressure():
-    """Matching meshes, turned by half a radian and pressed: one pressure at all points, 1e-8."""
+def test_rotated_patch_has_uniform_pressure():
+    """Matching meshes rotated by half a radian and pressed have uniform pressure, to 1e-10."""
     pair = Pair("triangle", fc.Frictionless(k_n=1e3), n=(5, 5), kinematics="finite")
     x = pair.pressed(pair.nodes, 0.01, 0.0) @ turn(2, 0.5).T
     pair.place(x)
@@ -321,7 +321,7 @@ def test_a_turned_patch_bears_a_uniform_pressure():
 
 
 def _led(cell, ways):
-    """Two bodies turned by 0.4 radians, the upper one led down and along from commit to commit."""
+    """Return two bodies rotated by 0.4 radians, the upper one translated from commit to commit."""
     pair = Pair(cell, fc.Coulomb(0.3, k_n=1e3, k_t=5e2), kinematics="finite")
     for down, along in ways:
         pair.contact.commit()
@@ -332,12 +332,15 @@ def _led(cell, ways):
 
 
 def _crossed(pair):
-    """A place that has crossed the other body since the last commit."""
+    """Return a point that has crossed the other body since the last commit, or None."""
     return TunnellingCheck([pair.contact]).evaluate(pair.before)["contact"].crossed
 
 
-def test_points_of_bodies_that_turned_before_are_where_they_are():
-    """A probe whose first bodies have turned so far that normals are along the undeformed Γc."""
+def test_probe_of_rotated_bodies_has_the_deformed_positions():
+    """A probe created for bodies rotated by 90° has the deformed positions of points, to 1e-12.
+
+    The normals are then along the undeformed Γc.
+    """
     pair = Pair("triangle", LAWS["coulomb"], kinematics="finite")
     pair.place(pair.pressed(pair.nodes, 0.05, 0.0) @ turn(2, np.pi / 2).T)
     pair.contact.evaluate()
@@ -351,17 +354,17 @@ def test_points_of_bodies_that_turned_before_are_where_they_are():
 @pytest.mark.parametrize(
     ("ways", "through"),
     [
-        ([(0.05, 0.0)], False),  # pressed, as penalties let it be
-        ([(0.2, 0.0)], False),  # less deep than a cell is high: it still has its opposite
+        ([(0.05, 0.0)], False),  # penetration as the penalty allows it
+        ([(0.2, 0.0)], False),  # penetration below the height of a cell: still paired
         ([(0.7, 0.1)], True),
         ([(1.2, -0.1)], True),  # out at the back
-        ([(-2.0, 0.0), (0.7, 0.1)], True),  # from far off
-        ([(0.0, 2.0), (1.2, 2.0), (1.2, 0.0)], False),  # round the edge, and below it
+        ([(-2.0, 0.0), (0.7, 0.1)], True),  # from a large distance
+        ([(0.0, 2.0), (1.2, 2.0), (1.2, 0.0)], False),  # around the edge, to below the body
         ([(0.05, 0.0), (0.05, 0.3), (-1.0, 0.0)], False),
     ],
 )
-def test_points_that_go_through_a_body_are_seen(cell, ways, through):
-    """Those that go straight through its surface in an increment, turned bodies as any."""
+def test_tunnelling_through_rotated_bodies_is_detected(cell, ways, through):
+    """Only points whose path in an increment enters the body too deep or leaves it are reported."""
     pair = _led(cell, ways)
     assert (_crossed(pair) is not None) == through
 
@@ -371,23 +374,24 @@ def test_points_that_go_through_a_body_are_seen(cell, ways, through):
 @pytest.mark.parametrize(
     ("ways", "through"),
     [
-        ([(-0.1, 0.0), (1.2, 1.0)], True),  # out at the back, beside it
-        ([(-0.1, 0.0), (-0.1, 1.2), (1.2, 1.2)], False),  # round the edge
-        ([(0.05, 0.0), (0.05, 1.2)], False),  # dragged off the end, pressed as it was
-        ([(0.05, 0.0), (0.3, 1.2)], False),  # off over its edge, less deep than a cell is high
+        ([(-0.1, 0.0), (1.2, 1.0)], True),  # out at the back and to the side
+        ([(-0.1, 0.0), (-0.1, 1.2), (1.2, 1.2)], False),  # around the edge
+        ([(0.05, 0.0), (0.05, 1.2)], False),  # dragged off the end at constant penetration
+        ([(0.05, 0.0), (0.3, 1.2)], False),  # over its edge, less deep than the height of a cell
     ],
 )
-def test_points_that_have_gone_through_and_aside_are_seen(cell, ways, through):
-    """Some of them: at the end their normals meet nothing of the body, before or behind them."""
+def test_tunnelling_of_unpaired_points_is_detected(cell, ways, through):
+    """Tunnelling is detected although no point has an opposite point after the increment."""
     pair = _led(cell, ways)
     assert not MPI.COMM_WORLD.allreduce(int(pair.contact.values.paired.any()))
     assert (_crossed(pair) is not None) == through
 
 
-def test_bodies_that_touch_at_first_take_as_many_steps_in_any_place():
-    """Gaps that are round-off are none: it closed some points, and held the first tangent by them.
+def test_number_of_newton_steps_is_independent_of_units_and_rotation():
+    """Initial gaps of bodies in touch that are round-off count as zero, and close no points.
 
-    Turned, or with lengths in another unit, the first increment took 14 steps or more, not 5.
+    Otherwise, rotated or in another unit of length, the first increment takes at least 14 steps
+    instead of 5.
     """
     found = []
     for size, angle in ((1.0, 0.0), (1e-3, 0.0), (1.0, 0.9)):
@@ -402,10 +406,10 @@ def test_bodies_that_touch_at_first_take_as_many_steps_in_any_place():
     assert found[1] == found[0] and found[2] == found[0]
 
 
-def test_no_body_is_pressed_through_the_other():
-    """Two cells deep in one increment: it fails, or is cut; the force is that of small increments.
+def test_increment_that_crosses_the_other_body_fails_or_is_cut():
+    """An increment of two cells fails in `solve`; `increments` reaches the force of small ones.
 
-    Without friction nothing tells how many increments there were: 1e-8, by the residuals.
+    Without friction the force is independent of the increments, to 1e-8 (the residuals).
     """
     forces = []
     for steps in (1, 4):
@@ -427,10 +431,11 @@ def test_no_body_is_pressed_through_the_other():
     np.testing.assert_allclose(forces[0], forces[1], atol=1e-8 * forces[1][1])
 
 
-def test_bodies_that_have_come_apart_are_in_balance_to_round_off():
-    """Dragged off the end, and on: nothing acts, and I + ∇u of the body at rest has round-off.
+def test_separated_bodies_are_in_equilibrium_to_round_off():
+    """Increments after a block is dragged off the end are accepted, with contact forces of zero.
 
-    Its residual, 1e-15, is no share of any force; increments in which all was open were refused.
+    The residual of the unloaded body, 1e-15, is the round-off of I + ∇u: there is no force to
+    compare it with.
     """
     blocks = Blocks("quadrilateral", fc.Coulomb(0.3), (12, 6))
 
@@ -443,10 +448,10 @@ def test_bodies_that_have_come_apart_are_in_balance_to_round_off():
     assert not forces[-3:].any()
 
 
-def test_bodies_that_just_touch_may_be_turned():
-    """By a full turn: what round-off lets them into each other between points is no penetration.
+def test_bodies_in_touch_can_rotate_by_a_full_turn():
+    """Round-off between the quadrature points is not reported as penetration.
 
-    Γc has two points, under which 20 facets of the other body are; 1e-14 deep it was refused.
+    Γc has two points, opposite to 20 facets of the other body; the penetration is 1e-14.
     """
     both = Two("newton", mu=0.3, n=(40, 1), rounded=0.1)
     steps = both.lead(0.0, 0.1, 2) + both.lead(0.05, 0.1, 2) + both.lead(0.05, 0.1, 36, 2 * np.pi)
@@ -455,11 +460,11 @@ def test_bodies_that_just_touch_may_be_turned():
 
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
-def test_bodies_that_start_deep_in_each_other(cell):
-    """Two columns overlap by 0.2, twice the height of their cells; they have no way aside.
+def test_initial_overlap_of_several_cells_is_resolved(cell):
+    """Two laterally constrained columns overlap by 0.2, twice the height of their cells.
 
-    Closed form: both take the stretch l by the stress (G + λ/2) (1/l - l), which is that of the
-    springs, k (l - 0.8): their heights are 1/2. To 1e-9 of the force.
+    Closed form: both have the stretch l, and their stress (G + λ/2) (1/l - l) is that of the
+    contact springs, k (l - 0.8), as their heights are 1/2. The force agrees to 1e-9.
     """
     body = stack(cell, (10, 10), (0.5, 0.5), apart=-0.2)
     u, k = body.u, 1e3
@@ -482,7 +487,7 @@ def test_bodies_that_start_deep_in_each_other(cell):
 
 
 def slotted() -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """A plate with a slot from its right side; tags of the slot's lips, of bottom and top end."""
+    """Return a plate slotted from its right side; tags of both slot faces, bottom and top."""
     whole = dolfinx.mesh.create_rectangle(
         MPI.COMM_SELF, [[0, 0], [2, 1.1]], (20, 11), dolfinx.mesh.CellType.quadrilateral
     )
@@ -499,10 +504,10 @@ def slotted() -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
     return mesh, tagged(mesh, chosen)
 
 
-def test_a_body_touches_itself():
-    """The lips of a slot: one surface without sides bears what two named ones do, to 1e-3.
+def test_self_contact_has_the_force_of_two_named_surfaces():
+    """Self-contact of both faces of a slot has the force of a slave and a master face, to 1e-3.
 
-    Both lips have points then, and so each half of the stiffness; they are not at the same places.
+    Both faces then have quadrature points, at different positions, each with half the stiffness.
     """
     forces = []
     for own, opposite, share in ((UPPER, LOWER, 20), ([LOWER, UPPER], [LOWER, UPPER], 10)):
@@ -526,8 +531,8 @@ def test_a_body_touches_itself():
     assert forces[1] == pytest.approx(forces[0], rel=1e-3)
 
 
-def test_round_off_is_allowed_for_wherever_a_body_comes_to_be_touched():
-    """A place of size 1 has the round-off of 1: at new partners, too, once the body has slid."""
+def test_round_off_magnitude_covers_the_dofs_of_new_pairs():
+    """Coordinates of size 1 count in the round-off of all coupled dofs, also after sliding."""
     pair = Pair("triangle", LAWS["coulomb"], kinematics="finite")
     bcs = [hold(pair.u, pair.tags, tag, i) for tag in (BOTTOM, TOP) for i in range(2)]
     form = residual(pair.u, ufl.TestFunction(pair.u.function_space), 100.0, 0.3)
@@ -544,8 +549,8 @@ def test_round_off_is_allowed_for_wherever_a_body_comes_to_be_touched():
     assert system.unknowns.comm.allreduce(new) > 0
 
 
-def test_where_a_surface_has_no_tangent_plane_there_is_no_residual():
-    """All of Γc drawn together in a line: a line search that comes there steps shorter."""
+def test_residual_of_a_degenerate_surface_is_nan():
+    """If Γc collapses to a line, the residual is NaN, and a line search shortens the step."""
     pair = Pair("tetrahedron", LAWS["coulomb"], kinematics="finite")
     bcs = [hold(pair.u, pair.tags, tag, i) for tag in (BOTTOM, TOP) for i in range(3)]
     form = residual(pair.u, ufl.TestFunction(pair.u.function_space), 100.0, 0.3)
@@ -563,12 +568,12 @@ def test_where_a_surface_has_no_tangent_plane_there_is_no_residual():
 
 
 @pytest.mark.parametrize("cell", CELLS)
-def test_facets_that_may_have_met(cell):
-    """Where bodies are in each other, or went through each other on the way; else none."""
+def test_candidate_facets_include_those_crossed_in_the_increment(cell):
+    """Candidates are found where bodies overlap or have crossed in the increment, else none."""
     pair = Pair(cell, LAWS["coulomb"], kinematics="finite")
     search, before = pair.contact.pairs.search, pair.u.copy()
     every, counts = len(search.rays.slave.facets.cells), []
-    # Apart by more than a cell; into each other; through each other; beyond, and still.
+    # Apart by more than a cell; into each other; through each other; beyond and at rest.
     for old, new in ((-2.0, -3.0), (-2.0, 0.01), (-2.0, 3.0), (3.0, 3.0)):
         pair.place(pair.pressed(pair.nodes, old, 0.0))
         before.x.array[:] = pair.u.x.array
@@ -576,7 +581,7 @@ def test_facets_that_may_have_met(cell):
         found = search.find_candidate_facets(pair.u, before, 0.0)
         total = [COMM.allreduce(len(near)) for near in found]
         counts.append(total)
-        if new > old:  # all of Γc lies over the other body
+        if new > old:  # all of Γc is opposite to the other body
             assert total[0] == COMM.allreduce(every) and total[1] > 0
     assert counts[0] == counts[3] == [0, 0]
 
@@ -584,10 +589,10 @@ def test_facets_that_may_have_met(cell):
 @pytest.mark.parametrize(
     ("cell", "degree"), [("triangle", 1), ("quadrilateral", 2), ("tetrahedron", 1)]
 )
-def test_condensed_as_on_all_unknowns(cell, degree):
-    """Static condensation of a linear bulk keeps all nodes of both surfaces: the same history.
+def test_static_condensation_gives_the_full_solution(cell, degree):
+    """Static condensation retains all nodes of both surfaces and gives the same history, to 1e-10.
 
-    One factorisation serves a block that is pressed, and dragged over facets of the other.
+    A block is pressed, and dragged over facets of the other one, with a single factorisation.
     """
     found, pair = [], None
     for condensation in (True, False):
@@ -611,7 +616,7 @@ def test_condensed_as_on_all_unknowns(cell, degree):
             side.value, down.value = 0.01 * np.array(place)
             step = problem.solve(recover_interior=False)
             problem.commit()
-            assert step.complete  # all of u is looked at, whatever was asked for
+            assert step.complete  # the checks need all of u, so it is recovered
             assert not condensation or step.factorisations == (number == 0)
             history.append([*step.contacts["contact"].force, *step.contacts["contact"].moment])
         found.append((np.array(history), pair.u.x.array.copy()))
@@ -620,8 +625,8 @@ def test_condensed_as_on_all_unknowns(cell, degree):
 
 
 @pytest.mark.parametrize("held", [True, False])
-def test_condensation_needs_bodies_that_are_held(held):
-    """A body that nothing but contact holds may be thrown out, which all unknowns tell."""
+def test_condensation_requires_constrained_bodies(held):
+    """A body constrained by contact only may be ejected, and its check needs all dofs."""
     pair = Pair("triangle", fc.Coulomb(0.3), kinematics="finite")
     tags = (BOTTOM, TOP) if held else (BOTTOM,)
     bcs = [hold(pair.u, pair.tags, tag, i) for tag in tags for i in range(2)]
@@ -633,13 +638,13 @@ def test_condensation_needs_bodies_that_are_held(held):
             fc.ContactProblem(*given[0], **given[1], condensation=True)
 
 
-def test_points_that_all_slip_while_friction_holds() -> None:
-    """Three loose blocks, each wider than the one below, on a floor that tilts to 0.95 of μ.
+def test_all_points_of_a_joint_slip_below_the_friction_limit() -> None:
+    """Three unconstrained blocks, each wider than the one below, are on a floor tilted to 0.95 μ.
 
-    Where the surfaces stretch apart all points of a joint may slip, some this way and some that,
-    while their friction still holds what lies on it. The slopes of the strained surfaces, 1e-4, are
-    all that the tangent has along the slip then: a step by it goes 1e4 times too far. By statics
-    tangential and normal forces of every joint are as sine and cosine of the angle.
+    Surfaces with different strain may slip at all points of a joint, in opposite directions, below
+    the friction limit. The tangent along the slip then has only the slopes of the strained
+    surfaces, 1e-4, and a Newton step is 1e4 times too long. By statics, the ratio of tangential to
+    normal force is the tangent of the angle in every joint, to 1e-6.
     """
     body = stack("quadrilateral", (4, 6, 4), (0.2, 0.2, 0.2), widths=(0.7, 1.0, 1.4), nu=0.2)
     weight = body.constant(np.zeros(2))

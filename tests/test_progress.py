@@ -1,4 +1,4 @@
-"""The bar of a history: what it counts, where it is silent, and what it leaves of a terminal."""
+"""Progress bar of `increments`: its percentage, its output on a terminal, and when it is off."""
 
 from __future__ import annotations
 
@@ -19,36 +19,36 @@ COMM = MPI.COMM_WORLD
 
 
 class Terminal(io.StringIO):
-    """What a program writes on a terminal."""
+    """A stream that records the output to a terminal."""
 
     def isatty(self) -> bool:
-        """It is one."""
+        """Return True, as a terminal does."""
         return True
 
     def lines(self) -> list[str]:
-        """What is seen of it at the end, without blanks behind."""
+        """Return the lines visible at the end, without trailing blanks."""
         seen = []
         for line in self.getvalue().split("\n"):
             shown = ""
-            for part in line.split("\r"):  # each is written over what is there
+            for part in line.split("\r"):  # each part overwrites the previous one
                 shown = part + shown[len(part) :]
             seen.append(shown.rstrip())
         return seen
 
     def shares(self) -> list[int]:
-        """All percentages ever shown, each once, in their order."""
+        """Return all percentages that were shown, each once, in order."""
         return list(dict.fromkeys(map(int, re.findall(r"(\d+)%\|", self.getvalue()))))
 
 
 def terminal_of(monkeypatch: pytest.MonkeyPatch) -> Terminal:
-    """In place of what this rank writes errors and bars to, from now on."""
+    """Replace `sys.stderr` of this rank, and return the replacement."""
     made = Terminal()
     monkeypatch.setattr(sys, "stderr", made)
     return made
 
 
 def history(ends: list[float], scene=None, **options) -> fc.Step:
-    """Lead the modulus of a pressed block, which any of its loads would do for."""
+    """Return the increments of a pressed block with its modulus as the load."""
     scene = scene or pressed()
     problem, _ = scene.problem(coulomb(), scene.rollers())
     start = float(scene.E.value)
@@ -56,8 +56,8 @@ def history(ends: list[float], scene=None, **options) -> fc.Step:
     return fc.increments(problem, scene.E, start, steps[-1], steps=steps, **options)
 
 
-def test_it_counts_the_way_of_the_load(monkeypatch):
-    """Not increments: of ways of 1, 3 and 4 an eighth, a half and all is done. First rank only."""
+def test_bar_shows_the_fraction_of_the_load_path(monkeypatch):
+    """Increments of length 1, 3 and 4 end at 12, 50 and 100 %; only the first rank has a bar."""
     terminal = terminal_of(monkeypatch)
     for step in history([1.1, 1.4, 1.8], progress="load"):
         assert step.load
@@ -67,8 +67,8 @@ def test_it_counts_the_way_of_the_load(monkeypatch):
     assert COMM.rank or re.match(r"load: 100%\|[█#]+\|, load 1800, 00:0\d<00:00$", last[0])
 
 
-def test_it_is_silent_without_a_terminal(monkeypatch):
-    """In a file, as a log of a queue is, and where nothing was asked for."""
+def test_no_bar_without_a_terminal_or_by_default(monkeypatch):
+    """There is no output to a file with `progress=True`, nor to a terminal by default."""
     log = io.StringIO()
     monkeypatch.setattr(sys, "stderr", log)
     list(history([1.1, 1.4], progress=True))
@@ -77,13 +77,13 @@ def test_it_is_silent_without_a_terminal(monkeypatch):
     assert log.getvalue() == sys.stderr.getvalue() == ""
 
 
-def test_bad_words():
-    """Neither words nor a switch; and no tqdm."""
+def test_invalid_progress_is_refused():
+    """`progress` is neither a text nor a bool: the error states its value."""
     raised_everywhere(lambda: history([1.1], progress=3), ValueError, "progress is 3")
 
 
-def test_without_tqdm(monkeypatch):
-    """It is said what is missing, on all ranks."""
+def test_missing_tqdm_is_reported(monkeypatch):
+    """Without tqdm `progress=True` raises an error that names it on all ranks."""
     monkeypatch.setitem(sys.modules, "tqdm", None)
     raised_everywhere(lambda: history([1.1], progress=True), ValueError, "tqdm")
     list(history([1.1]))

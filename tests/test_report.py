@@ -1,4 +1,4 @@
-"""The page of a history: well formed, whole without other files, and of the right numbers."""
+"""The HTML report of a history: well-formed, self-contained, and with the correct numbers."""
 
 import base64
 import csv
@@ -26,12 +26,12 @@ pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
 class Page(HTMLParser):
-    """What a browser would find.
+    """The contents of a report, as a browser reads it.
 
     Attributes:
         tables: Rows of cells by caption.
-        pictures: Captions and bytes.
-        text: All that is written.
+        pictures: Bytes by caption.
+        text: The whole text.
         outside: Addresses of anything that is not in the file.
     """
 
@@ -46,7 +46,7 @@ class Page(HTMLParser):
         assert self._open == []
 
     def handle_starttag(self, tag, attrs):
-        """See `HTMLParser`."""
+        """Store pictures, addresses and the beginning of a table cell."""
         found = dict(attrs)
         for name in ("src", "href"):
             address = found.get(name)
@@ -62,14 +62,14 @@ class Page(HTMLParser):
             self._open.append(tag)
 
     def handle_endtag(self, tag):
-        """See `HTMLParser`."""
+        """Close an element, and store the rows of a table."""
         assert self._open.pop() == tag
         if tag == "table":
             self.tables.setdefault(self._caption, self._rows)
             self._rows, self._caption = [], ""
 
     def handle_data(self, data):
-        """See `HTMLParser`."""
+        """Store the text of the page, of a caption or of a cell."""
         if "style" in self._open:
             assert "url(" not in data and "@import" not in data
             return
@@ -80,11 +80,11 @@ class Page(HTMLParser):
             self._rows[-1][-1] += data
 
     def check(self, problem, steps):
-        """What every page must have."""
+        """Check everything that a report of any problem must contain."""
         assert self.outside == []
         assert all(picture.startswith(PNG) for picture in self.pictures.values())
         plane = problem.u.function_space.mesh.geometry.dim == 2
-        # Deformed body, history of each contact and of all; of each contact (the same captions).
+        # Deformed body, history of each contact and of all; 2 or 5 captions common to all contacts.
         assert len(self.pictures) == 2 + len(problem.contacts) + (2 if plane else 5)
         assert "verification passed" in self.text and "verification failed" not in self.text
         small = any(not contact.finite for contact in problem.contacts)
@@ -100,7 +100,7 @@ class Page(HTMLParser):
                 told = ", ".join(f"{x:g}" for x in np.ravel(constant.value))
                 scaled = isinstance(getattr(contact.law, name, None), fc.RelativeStiffness)
                 assert chosen[name] == told + (" E/h" if scaled else "")
-        extents = self.tables["Extents on the undeformed surface"]  # of the first contact
+        extents = self.tables["Extents on the undeformed surface"]  # of the first contact only
         found = steps[-1].contacts[problem.contacts[0].name].extents
         for (name, area, *_), (state, extent) in zip(extents[1:], found.items(), strict=True):
             assert name == state and area == f"{extent.area:.6g}"
@@ -110,7 +110,7 @@ class Page(HTMLParser):
 
 @pytest.fixture
 def curves(monkeypatch):
-    """What was drawn on the first rank: x and y of the curves by the label of the y axis."""
+    """Record the curves drawn on the first rank: x and y by the labels of y axis and curve."""
     found, save = {}, drawing.save
 
     def keep(figure, path):
@@ -125,12 +125,12 @@ def curves(monkeypatch):
 
 
 def drawn(curves, key, n=0):
-    """Of the first rank, on all."""
+    """Return the n-th curve of a key, broadcast from the first rank to all ranks."""
     return COMM.bcast(curves[key][n] if COMM.rank == 0 else None)
 
 
-def test_a_resumed_history(tmp_path, curves):
-    """Two contacts, multipliers, there and back; broken off, and the curves are of all increments.
+def test_report_of_a_restarted_history(tmp_path, curves):
+    """Two contacts, multipliers, a load reversal, and a restart: curves contain all increments.
 
     References: the steps of both runs.
     """
@@ -180,7 +180,7 @@ def test_a_resumed_history(tmp_path, curves):
         assert close(y, [step.contacts[name].extents["stick"].area for step in steps], 1e-14)
     x, y = drawn(curves, ("energy [kN m/m]", "dissipation by friction"))
     assert close(y, np.cumsum([step.energy.dissipation for step in steps]), 1e-14)
-    # At the points: what `gather` has, of those near the contact.
+    # At the points near the contact: the values of `gather`.
     points = made.problem.contacts[0].gather()
     x, y = drawn(curves, ("traction [kPa]", "pressure"))
     assert close([y.max()], [points["pressure"].max()], 1e-14)
@@ -188,7 +188,7 @@ def test_a_resumed_history(tmp_path, curves):
 
 
 def space():
-    """A block in space, and its stress."""
+    """Return the problem, steps and stress of a block in space."""
     made = Rub(cell="tetrahedron")
     made.problem.small_displacement_tolerance = np.inf
     steps = list(fc.increments(made.problem, made.load, 0, 2, steps=2))
@@ -196,19 +196,19 @@ def space():
 
 
 def bodies():
-    """Two bodies, pairs found anew."""
+    """Return the problem and steps of two bodies whose pairs are updated."""
     made = Ramp()
     return made.problem, list(made.increments(1.0)), None
 
 
 def finite():
-    """Rubber under a disc that moves far."""
+    """Return the problem and steps of rubber under a disc with large displacements."""
     made = Tool()
     return made.problem, list(made.increments(1.0)), None
 
 
 def alone():
-    """One increment without a load parameter, not committed."""
+    """Return the problem and one step without a load parameter, not committed."""
     made = Rub(fc.Coulomb(0.3))
     made.problem.small_displacement_tolerance = np.inf
     made.move(0.01, 0.03)
@@ -217,8 +217,8 @@ def alone():
 
 @pytest.mark.each
 @pytest.mark.parametrize("scene", [space, bodies, finite, alone], ids=lambda f: f.__name__)
-def test_all_kinds(scene, tmp_path, curves):
-    """In space, between bodies, at large displacements, and for a step that is not committed."""
+def test_report_of_every_kind_of_problem(scene, tmp_path, curves):
+    """Reports in space, between bodies, with large displacements, and of a step not committed."""
     problem, steps, sigma = scene()
     path = fc.report(problem, steps, shared_folder(tmp_path), stress=sigma)
     steps = [steps] if isinstance(steps, fc.Step) else steps
@@ -231,11 +231,11 @@ def test_all_kinds(scene, tmp_path, curves):
     assert close(force[0], loads, 1e-14)
 
 
-def test_an_unloaded_body(tmp_path):
-    """Pressed and let go: there are no forces, which a residual of round-off is no share of.
+def test_report_of_an_unloaded_body(tmp_path):
+    """A body is pressed and released: without forces a residual has no meaningful relative value.
 
-    By the line, the table of a step, the page and the file alike; what is round-off beside the
-    residual that passes is 0. A displacement of round-off is not drawn 1e20 times as large.
+    This holds for the log line, the table of a step, the report and the CSV file; a residual that
+    is round-off is stated as 0. A displacement that is round-off is not magnified by 1e20.
     """
     folder = shared_folder(tmp_path)
     scene = block("quadrilateral", degree=2, n=4)
@@ -251,7 +251,7 @@ def test_an_unloaded_body(tmp_path):
         assert ("; no forces; " in step.summary()) != loaded
         assert ("; no forces</p>" in step._repr_html_()) != loaded
         assert step.verdict.is_loaded == loaded
-    assert steps[-1].contacts["contact"].normal_force != 0.0  # round-off, else this tests nothing
+    assert steps[-1].contacts["contact"].normal_force != 0.0  # round-off, as required here
     assert "; contact: no contact force" in steps[-1].summary()
     assert "stick" not in steps[-1].summary() and "stick" in steps[0].summary()
     assert steps[-1].verdict.relative_residual == 0.0
@@ -263,8 +263,8 @@ def test_an_unloaded_body(tmp_path):
     assert residuals[-1] == "" and all(0 <= float(r) < 1e-9 for r in residuals[:-1])
 
 
-def test_bad_input(tmp_path):
-    """On all ranks, before any work; there is no page."""
+def test_invalid_input_is_refused(tmp_path):
+    """Invalid input is refused on all ranks, before any work; no report is written."""
     folder = shared_folder(tmp_path)
     made = Rub()
     made.problem.small_displacement_tolerance = np.inf
@@ -307,8 +307,8 @@ def test_bad_input(tmp_path):
     assert not (page / "report.html").exists()
 
 
-def test_a_failure_leaves_the_page_before(tmp_path, monkeypatch):
-    """A picture that cannot be drawn: the error on all ranks, the page as it was."""
+def test_failure_keeps_the_previous_report(tmp_path, monkeypatch):
+    """If a picture cannot be drawn, all ranks raise the error, and the report is unchanged."""
     folder = shared_folder(tmp_path)
     made = Rub()
     made.problem.small_displacement_tolerance = np.inf

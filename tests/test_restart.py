@@ -1,9 +1,9 @@
-"""Going on from a file: the digits of the run that went on, in the right place.
+"""Restarted histories agree with uninterrupted ones and continue at the stored load.
 
-A history is solved whole, and again broken off and taken up by a problem made anew. Serially the
-two are compared bit for bit; on several ranks MUMPS adds in the order in which messages come, and
-two solutions within the tolerance of 1e-9 on the residual are compared: 1e-7, or what a preset
-solves to.
+A history is solved in one run, and again interrupted and restarted by a new problem. Serially the
+two are compared bit for bit; on several ranks MUMPS adds in the order in which messages arrive, and
+two solutions within the tolerance of 1e-9 on the residual are compared: to 1e-7, or to the accuracy
+of a preset.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ COMM = MPI.COMM_WORLD
 pytestmark = pytest.mark.mpi
 
 
-# ---- the same digits -----------------------------------------------------------------------------
+# ---- agreement with uninterrupted histories ------------------------------------------------------
 
 
 @pytest.mark.each
 @pytest.mark.parametrize(("update", "stop"), [("increment", 5), ("auto", 2), ("auto", 6)])
 @pytest.mark.parametrize("condensation", [None, False])
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_pairs_found_anew(cell, condensation, update, stop, tmp_path):
-    """Up a ramp: the pairs, and the unknowns kept when condensed, are those of the slid block.
+def test_restart_with_updated_pairs(cell, condensation, update, stop, tmp_path):
+    """On a ramp, pairs and retained dofs after the restart are those of the slid block.
 
-    By default they are found anew only once it has slid: broken off before, and after that.
+    By default pairs are updated only after the block has slid: interrupted before and after that.
     """
     make = lambda: Ramp(  # noqa: E731
         cell=cell,
@@ -70,7 +70,7 @@ HOW = {
 
 
 def products() -> list[tuple]:
-    """A sample, the same every time, in which each choice occurs."""
+    """Return a reproducible sample of combinations in which each choice occurs."""
     choices = itertools.product(
         ["fixed", "moving", "force", "ramp"],
         LAWS,
@@ -94,8 +94,8 @@ def products() -> list[tuple]:
 @pytest.mark.each
 @pytest.mark.newest
 @pytest.mark.parametrize(("obstacle", "law", "how", "method", "extra"), products())
-def test_products(obstacle, law, how, method, extra, tmp_path):
-    """Obstacles, laws, enforcement, methods and ways to lead a history, in combination."""
+def test_restart_of_combined_options(obstacle, law, how, method, extra, tmp_path):
+    """Restarts agree for combined obstacles, laws, enforcement, methods and history options."""
     options = {}
     if extra == "estimate":
         options["estimate"] = True
@@ -120,16 +120,16 @@ def test_products(obstacle, law, how, method, extra, tmp_path):
             method=method,
         )
 
-    # A preset solves to a hundredth of its error, the multipliers to a share of the tractions.
+    # A preset solves to 1e-2 of its error, multipliers to a fraction of the tractions.
     tolerance = {"draft": 5e-3, "standard": 1e-3, "augmented": 1e-4}.get(how, 1e-6)
     goes_on(make, shared_folder(tmp_path), stop=5, tolerance=tolerance, **options)
 
 
 @pytest.mark.parametrize("make", [Press, Ramp])
-def test_cut_increments(make, tmp_path):
-    """Where increments were cut, and how they grow again, is part of the place in the history.
+def test_restart_after_cut_increments(make, tmp_path):
+    """Cut increments and their later growth are part of the stored position in the load path.
 
-    Increments above 0.3 fail: each of 0.5 is halved, and grows again after two.
+    Increments above 0.3 fail: those of 0.5 are halved, and grow again after two.
     """
 
     def tamper(made):
@@ -138,7 +138,7 @@ def test_cut_increments(make, tmp_path):
 
         def note(t):
             now[0] = t
-            at[:] = at or [t]  # the first is where the history stands
+            at[:] = at or [t]  # the first is the committed load
             load(t)
 
         def choosy(**options):
@@ -157,14 +157,14 @@ def test_cut_increments(make, tmp_path):
     goes_on(make, shared_folder(tmp_path), stop=5, tamper=tamper)
 
 
-def test_errors_are_estimated_of_a_state_taken_up(tmp_path):
-    """The budget of a finished history is that of the run that solved it (1e-6, as solved)."""
+def test_error_estimate_of_a_restarted_state(tmp_path):
+    """The error budget of a restarted history is that of the run that solved it (1e-6)."""
     path, budgets = shared_folder(tmp_path) / "state.npz", []
     for condensation in (True, True, False):
         made = Press(condensation=condensation)
         list(made.increments(checkpoint=path))
         scene = made.scene
-        sigma = ufl.variable(strain(scene.u))  # not that of the form: of both the same
+        sigma = ufl.variable(strain(scene.u))  # not that of the form, but the same in all runs
         budget = fc.estimate_errors(made.problem, 1000.0 * sigma, strain=strain(scene.u))
         budgets.append(budget.relative("enforcement"))
     for budget in budgets[1:]:
@@ -173,8 +173,8 @@ def test_errors_are_estimated_of_a_state_taken_up(tmp_path):
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="MUMPS adds in the order in which messages come")
-def test_the_same_again_has_the_same_digits():
-    """By L-BFGS, wherever in memory its vectors lie: what is in between shifts them."""
+def test_repeated_histories_are_bit_identical():
+    """L-BFGS does not depend on the memory addresses of its vectors, which other arrays shift."""
     made, between = [], []
     options = {"cell": "triangle", "n": 3, "method": "lbfgs", "contact": HOW["standard"]}
     for n in range(8):
@@ -200,7 +200,7 @@ if made.problem.u.function_space.mesh.comm.rank == 0:
 
 
 def run_script(ranks: int, **values) -> dict[str, np.ndarray]:
-    """Run a history in a process of its own, and see where it ends."""
+    """Run a history in a process of its own and return its final values."""
     script = SCRIPT.format(**values)
     words = command(ranks, "-c", script)
     done = subprocess.run(words, env=environment(), capture_output=True, text=True, timeout=300)
@@ -218,8 +218,8 @@ def run_script(ranks: int, **values) -> dict[str, np.ndarray]:
         ("Press(cell='tetrahedron', n=2, wall=True, obstacle='moving')", (2, 1)),
     ],
 )
-def test_on_another_number_of_ranks(scene, ranks, tmp_path):
-    """The state found by place: to the tolerance of the solver, or of the multipliers."""
+def test_restart_on_another_number_of_ranks(scene, ranks, tmp_path):
+    """The state is assigned by location (tolerance 1e-6, or 1e-4 with multipliers)."""
     first, second = ranks
     alone = run_script(second, scene=scene, path=str(tmp_path / "alone.npz"), stop=0)
     path = str(tmp_path / "state.npz")
@@ -233,11 +233,11 @@ def test_on_another_number_of_ranks(scene, ranks, tmp_path):
             assert close(after[name], alone[name], 1e-4 if "augmented" in scene else 1e-6), name
 
 
-# ---- the place in the load path ------------------------------------------------------------------
+# ---- position in the load path -------------------------------------------------------------------
 
 
 def there_and_back(made, path, *, stop=0):
-    """Down and along, back to the start, and there again; ended after ``stop`` increments."""
+    """Load to 2, unload to 1, reload to 2, stop after ``stop`` increments; return the loads."""
     loads = []
     for start, end, steps in ((0.0, 2.0, 4), (2.0, 1.0, 2), (1.0, 2.0, 2)):
         for step in made.increments(end, start, steps=steps, checkpoint=path):
@@ -249,8 +249,8 @@ def there_and_back(made, path, *, stop=0):
 
 @pytest.mark.parametrize("stop", [1, 4, 5, 7])
 @pytest.mark.parametrize("make", [Press, Ramp])
-def test_several_calls_go_on_in_the_right_place(make, stop, tmp_path):
-    """Loading, unloading, loading with one file, ended in any of them, also at their ends."""
+def test_restart_within_several_calls_of_increments(make, stop, tmp_path):
+    """Loading, unloading, reloading with one file are interrupted in and at the end of a call."""
     folder = shared_folder(tmp_path)
     whole, broken, after = make(), make(), make()
     loads = there_and_back(whole, folder / "whole.npz")
@@ -259,8 +259,8 @@ def test_several_calls_go_on_in_the_right_place(make, stop, tmp_path):
     assert differences(after, whole, 0.0 if COMM.size == 1 else 1e-7) == []
 
 
-def test_the_order_of_calls_counts(tmp_path):
-    """The second call first, or a first one that leads elsewhere though the second is the same."""
+def test_calls_in_another_order_are_refused(tmp_path):
+    """The second call is refused as the first one, and so is a first call with another end."""
     path = shared_folder(tmp_path) / "state.npz"
     there_and_back(Press(), path, stop=5)
     made = Press()
@@ -270,8 +270,8 @@ def test_the_order_of_calls_counts(tmp_path):
     raised_everywhere(call, ValueError, "from 0 to 2.5 by 5", "from 0 to 2 by 4")
 
 
-def test_a_longer_way_and_other_steps_ahead(tmp_path):
-    """A finished history led further, and one whose rest is led otherwise: as led so at once."""
+def test_restart_with_later_end_or_other_remaining_steps(tmp_path):
+    """A finished history is extended as if solved in one run; its remaining steps may differ."""
     folder = shared_folder(tmp_path)
     first, further, whole = Press(), Press(), Press()
     list(first.increments(2.0, checkpoint=folder / "state.npz"))
@@ -285,8 +285,8 @@ def test_a_longer_way_and_other_steps_ahead(tmp_path):
     assert rest == [4.1]
 
 
-def test_a_modulus_that_the_load_changes_goes_on(tmp_path):
-    """Springs of 10 E/h follow E in the form: they are those of the load that the file is at."""
+def test_restart_with_a_modulus_changed_by_the_load(tmp_path):
+    """Contact stiffnesses of 10 E/h follow E in the form, here that of the stored load (1e-12)."""
     folder = shared_folder(tmp_path)
 
     def run(stop, path):
@@ -309,8 +309,8 @@ def test_a_modulus_that_the_load_changes_goes_on(tmp_path):
     assert run(1.0, folder / "two.npz") == pytest.approx(whole, rel=1e-12, abs=1e-12)
 
 
-def test_a_loop_that_was_left_goes_on(tmp_path):
-    """The same call on the same problem, after a failure with other steps, is no new one."""
+def test_interrupted_loop_continues_with_other_steps(tmp_path):
+    """The same call on the same problem, with other steps, continues the history (1e-7)."""
     path = shared_folder(tmp_path) / "state.npz"
     made, whole = Press(), Press()
     for step in made.increments(2.0, checkpoint=path):
@@ -325,11 +325,11 @@ def test_a_loop_that_was_left_goes_on(tmp_path):
 @pytest.mark.each
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 @pytest.mark.parametrize("obstacle", ["rigid", "body", "body, pairs found anew"])
-def test_results_of_a_finished_history(obstacle, enforcement, tmp_path):
+def test_restart_restores_results_of_a_finished_history(obstacle, enforcement, tmp_path):
     """Counts of open, sticking and slipping points are those of the last increment.
 
-    At its end they all stick: to be told how they came there takes what was evaluated before the
-    commit. By the same call of `increments`, and by `checkpoint.load`.
+    After the commit all closed points stick: the counts require the values evaluated before it.
+    They are restored by the same call of `increments`, and by `checkpoint.load`.
     """
 
     def make():
@@ -338,7 +338,7 @@ def test_results_of_a_finished_history(obstacle, enforcement, tmp_path):
             return Press(**given)
         return Ramp(update_pairs="increment" if "anew" in obstacle else "never", **given)
 
-    end = 1.9  # pairs that stay hold for a slide by one facet, which is at 2
+    end = 1.9  # at 2 the slip distance reaches a facet, the limit without pair updates
     path = shared_folder(tmp_path) / "state.npz"
     one, called, loaded = make(), make(), make()
     *_, step = one.increments(end, checkpoint=path)
@@ -359,8 +359,8 @@ def test_results_of_a_finished_history(obstacle, enforcement, tmp_path):
         assert close(at_points(contact, contact.slip_increment), slid, tolerance)
 
 
-def test_a_rank_without_nodes_goes_on(tmp_path):
-    """A body of one cell, of which other ranks than one have nothing: as one that went on."""
+def test_restart_with_ranks_without_nodes(tmp_path):
+    """A body of one cell, so that only one rank has nodes, agrees after the restart (1e-7)."""
     folder = shared_folder(tmp_path)
     whole, stopped, after = (Rub(mesh={"n": 1}) for _ in range(3))
     for _ in fc.increments(whole.problem, whole.load, 0.0, 2.0, steps=4):

@@ -1,4 +1,4 @@
-"""Fields of the caller in the file: all kinds of them, and those that are forgotten."""
+"""User fields in checkpoints: all kinds of them, and missing ones."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.mpi
 
 
 def more_fields(made: Press) -> list[fem.Function]:
-    """Functions of all kinds that can be saved."""
+    """Return functions of all kinds that can be saved."""
     mesh, submesh = made.scene.mesh, made.problem.contacts[0].surface.submesh
     cell = mesh.basix_cell()
     d = mesh.geometry.dim
@@ -42,12 +42,12 @@ def more_fields(made: Press) -> list[fem.Function]:
 
 
 def wave(x: np.ndarray, k: float) -> np.ndarray:
-    """Something that is nowhere the same, (n,)."""
+    """Return values, (n,), that differ between all points."""
     return np.sin(3.0 * k + x @ np.array([2.3, 5.1, 3.7]))
 
 
 def fill(fields: list[fem.Function], k: float) -> None:
-    """Values that follow from the place, the component, the cell beside and ``k``."""
+    """Set values that depend on the point, the component, the adjacent cell and ``k``."""
     for i, field in enumerate(fields):
         places = locate_nodes(field.function_space)
         d = places.shape[1] // 2
@@ -60,8 +60,8 @@ def fill(fields: list[fem.Function], k: float) -> None:
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_fields_of_every_kind(cell, tmp_path):
-    """Saved as the loop leaves them and set when the history goes on, ghosts included."""
+def test_fields_of_every_kind_are_saved_and_restored(cell, tmp_path):
+    """Fields are saved after an increment's loop body and set at restart, with ghosts, to 1e-12."""
     path = shared_folder(tmp_path) / "state.npz"
     made, after = Press(cell=cell, n=2), Press(cell=cell, n=2)
     fields = more_fields(made)
@@ -70,7 +70,7 @@ def test_fields_of_every_kind(cell, tmp_path):
         if step.increment == 3:
             break
     fields, expected = more_fields(after), more_fields(after)
-    # The third was left in the middle of the loop: the file has the second.
+    # The loop was left in the third increment: the file has the second one.
     fill(expected, 2)
     steps = after.increments(checkpoint=path, state_fields=fields)
     assert next(steps).increment == 3
@@ -87,8 +87,8 @@ def test_fields_of_every_kind(cell, tmp_path):
 
 
 @pytest.mark.parametrize("bulk", ["linear with plastic", "nonlinear"])
-def test_plastic_strains_go_on(bulk, tmp_path):
-    """A strain that the loop lets grow with the compression: same digits with it in the file."""
+def test_restart_with_plastic_strains(bulk, tmp_path):
+    """A restart with a strain that grows in the loop is bitwise the same, 1e-7 on several ranks."""
     folder = shared_folder(tmp_path)
 
     def run(made, path, stop=0):
@@ -116,8 +116,8 @@ def test_plastic_strains_go_on(bulk, tmp_path):
     assert close(gathered(COMM, owned(after.plastic)), gathered(COMM, owned(whole.plastic)), 1e-7)
 
 
-def test_fields_that_are_forgotten(tmp_path, caplog):
-    """Changed by the loop and not in the file: a warning, once; going on is refused."""
+def test_fields_missing_in_a_checkpoint_are_reported(tmp_path, caplog):
+    """A field changed by the loop but not saved causes one warning, and a restart is refused."""
     path = shared_folder(tmp_path) / "state.npz"
     made = Press(bulk="nonlinear")
     with pytest.warns(UserWarning, match="plastic in the bulk form") as warned:
@@ -131,8 +131,8 @@ def test_fields_that_are_forgotten(tmp_path, caplog):
     raised_everywhere(lambda: next(after.increments(checkpoint=path)), ValueError, "bulk")
 
 
-def test_fields_that_cannot_be_saved(tmp_path):
-    """Refused at the call, by name."""
+def test_fields_that_cannot_be_saved_are_refused(tmp_path):
+    """Fields that cannot be saved are named in an error when the history is set up."""
     path = shared_folder(tmp_path) / "state.npz"
     made = Press()
     mesh = made.scene.mesh

@@ -1,4 +1,4 @@
-"""What is no file of this scene, of this path or of any state is refused, by name and undone."""
+"""Checkpoints of other data or load paths and damaged ones are refused without side effects."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.mpi
 
 @pytest.fixture
 def saved(tmp_path):
-    """A file with half of a history."""
+    """Return the path of a checkpoint of a history stopped after increment 3."""
     path = shared_folder(tmp_path) / "state.npz"
     made = Press(wall=True)
     for step in made.increments(checkpoint=path):
@@ -66,7 +66,10 @@ OTHER = {
 @pytest.mark.whole
 @pytest.mark.parametrize("other", OTHER)
 def test_changed_data_are_refused(other, saved):
-    """Each is named with both values; the problem is as before, and goes on if it is told to."""
+    """The error names the change, with both values of a number, and the problem is unchanged.
+
+    With ``on_mismatch="continue"`` the history continues.
+    """
     options, words = OTHER[other]
     options = {n: v() if callable(v) else v for n, v in options.items()}
     made, fresh = Press(wall=True, **options), Press(wall=True, **options)
@@ -75,7 +78,7 @@ def test_changed_data_are_refused(other, saved):
     raised_everywhere(call, ValueError, str(saved), *words, "remove it", "continue")
     assert made.problem.increment == 0 and saved.read_bytes() == before
     assert [c.value.max() for c in made.push] == [0.0, 0.0]
-    # As if there had been no file.
+    # The problem is as if there had been no file.
     for each in (made, fresh):
         each.load(0.5)
         each.problem.solve()
@@ -87,7 +90,7 @@ def test_changed_data_are_refused(other, saved):
 
 
 def test_other_loads_and_conditions_are_refused(saved):
-    """A load beside the one that is led, another value or component of a condition."""
+    """An additional load, and another value or component of a condition, are refused."""
     made = Press(wall=True)
     made.scene.load(side=1.0)
     call = lambda: next(made.increments(checkpoint=saved))  # noqa: E731
@@ -116,8 +119,8 @@ FIXED = {
 
 @pytest.mark.whole
 @pytest.mark.parametrize("other", FIXED)
-def test_what_cannot_be_taken_over_is_refused_in_any_case(other, saved):
-    """Other meshes, elements, points and histories have no place for the state."""
+def test_incompatible_checkpoints_are_always_refused(other, saved):
+    """States of other meshes, elements, points or history fields cannot be transferred."""
     options, words = FIXED[other]
     options = {n: v() if callable(v) else v for n, v in options.items()}
     for changed in ("refuse", "continue"):
@@ -129,8 +132,8 @@ def test_what_cannot_be_taken_over_is_refused_in_any_case(other, saved):
         assert made.problem.increment == 0
 
 
-def test_nodes_elsewhere_are_another_mesh(saved):
-    """As many of them, and some a millionth of the body off."""
+def test_mesh_with_displaced_nodes_is_refused(saved):
+    """The number of nodes is the same, but some are displaced by 1e-6 of the body's size."""
     made = Press(wall=True)
     x = made.scene.mesh.geometry.x
     x[np.all(np.abs(x[:, :2] - 0.5) < 1e-9, axis=1), 0] += 1e-6
@@ -138,8 +141,8 @@ def test_nodes_elsewhere_are_another_mesh(saved):
     raised_everywhere(call, ValueError, "nodes", "locations")
 
 
-def test_data_that_the_load_changes_are_no_change(tmp_path):
-    """A friction coefficient and an obstacle as loads: compared where the history stands."""
+def test_data_changed_by_the_load_are_accepted(tmp_path):
+    """A friction coefficient and an obstacle set by the load are compared at the stored load."""
     path = shared_folder(tmp_path) / "state.npz"
 
     class Both(Press):
@@ -152,8 +155,8 @@ def test_data_that_the_load_changes_are_no_change(tmp_path):
     assert [s.increment for s in after.increments(checkpoint=path)] == list(range(2, 9))
 
 
-def test_a_nonlinear_bulk_is_compared_at_the_state(tmp_path):
-    """Two bodies that differ in what they make of a strain, and not when undeformed."""
+def test_nonlinear_bulk_is_compared_at_the_stored_state(tmp_path):
+    """Two bodies whose stiffness differs only when they are deformed are distinguished."""
     path = shared_folder(tmp_path) / "state.npz"
     made = Press(bulk="nonlinear")
     next(made.increments(checkpoint=path))
@@ -163,8 +166,8 @@ def test_a_nonlinear_bulk_is_compared_at_the_state(tmp_path):
     )
 
 
-def test_a_state_that_is_not_committed_is_not_saved(tmp_path):
-    """Solved and not committed: refused, and nothing is written; committed or restored it is."""
+def test_uncommitted_state_is_not_saved(tmp_path):
+    """Before `commit` or `restore` nothing is written; after it, the committed state is saved."""
     path = shared_folder(tmp_path) / "state.npz"
     for end in ("commit", "restore"):
         made = Press()
@@ -190,15 +193,15 @@ def test_a_state_that_is_not_committed_is_not_saved(tmp_path):
         COMM.barrier()
 
 
-# ---- the place in the load path ------------------------------------------------------------------
+# ---- position in the load path -------------------------------------------------------------------
 
 
-def test_another_path_is_refused(saved):
-    """Both paths are told; what is done must be what is asked for."""
+def test_other_load_paths_are_refused(saved):
+    """The error states both load paths; the requested one must contain the stored loads."""
     for arguments in (
-        {"end": 0.5, "steps": 1},  # behind the place
+        {"end": 0.5, "steps": 1},  # ends before the stored load
         {"end": -1.0, "steps": 2},
-        {"steps": 4},  # 1, 2, 3, 4: it went by halves
+        {"steps": 4},  # 1, 2, 3, 4; the stored increments are 0.5
         {"start": 0.25, "steps": 8},
         {"end": 5.0, "steps": 8},
     ):
@@ -216,8 +219,8 @@ def test_another_path_is_refused(saved):
 # ---- damaged files -------------------------------------------------------------------------------
 
 
-def test_any_flipped_bit_and_any_cut_is_found(saved):
-    """All over the file and at its ends; the problem is as before, and takes the whole file."""
+def test_flipped_bits_and_truncated_files_are_detected(saved):
+    """Damage anywhere is refused; the problem is unchanged, and then reads the intact file."""
     content = saved.read_bytes()
     COMM.barrier()
     made, n = Press(wall=True), len(content)
@@ -237,15 +240,15 @@ def test_any_flipped_bit_and_any_cut_is_found(saved):
 
 
 def write(path: Path, content: bytes) -> None:
-    """By rank 0, seen by all."""
+    """Write a file on rank 0, visible to all ranks on return."""
     COMM.barrier()
     if COMM.rank == 0:
         path.write_bytes(content)
     COMM.barrier()
 
 
-def test_other_formats(tmp_path):
-    """A text, an array, an archive of something else, and a checkpoint of another format."""
+def test_other_file_formats_are_refused(tmp_path):
+    """Texts, arrays, other archives and checkpoints of another format are refused."""
     path = shared_folder(tmp_path) / "state.npz"
     made = Press()
     call = lambda: next(made.increments(checkpoint=path))  # noqa: E731
@@ -268,7 +271,7 @@ def test_other_formats(tmp_path):
 
 
 def spoilt(name):
-    """What a file's array is replaced by, whole but for that."""
+    """Return a function that corrupts an array, or None if the array is to be removed."""
 
     def nan(array):
         array = array.copy()
@@ -290,8 +293,8 @@ def spoilt(name):
 @pytest.mark.each
 @pytest.mark.parametrize("how", ["nan", "complex", "single", "words", "scalar", "short", "none"])
 @pytest.mark.parametrize("what", ["nodes", "contact floor", "stiffness", "state", "numbers"])
-def test_arrays_that_are_none_of_a_state(what, how, saved):
-    """A file that is whole, with numbers that are none or of another kind."""
+def test_corrupted_arrays_are_refused(what, how, saved):
+    """A file with a valid checksum is refused if an array is missing, not finite or mistyped."""
     if COMM.rank == 0:
         scene, arrays = checkpoint_file.read_file(saved)
         change = spoilt(how)
@@ -309,8 +312,8 @@ def test_arrays_that_are_none_of_a_state(what, how, saved):
     assert [float(c.value) for c in made.push] == [0.0, 0.0]
 
 
-def test_what_cannot_be_read_or_written(saved, monkeypatch):
-    """A folder, one that is not there, and no right to read: OSError, or refused at the call."""
+def test_unreadable_files_and_missing_folders_are_refused(saved, monkeypatch):
+    """A folder or an unreadable file raises OSError; a missing folder is refused at the call."""
     made, folder = Press(wall=True), saved.parent
     call = lambda path: next(made.increments(checkpoint=path))  # noqa: E731
     raised_everywhere(lambda: call(folder), OSError)
@@ -327,8 +330,8 @@ def test_what_cannot_be_read_or_written(saved, monkeypatch):
     assert made.problem.increment == 0
 
 
-def test_a_load_that_fails_leaves_the_problem(saved):
-    """The function that sets the loads raises at the stored place."""
+def test_failing_load_function_leaves_the_problem_unchanged(saved):
+    """The function that sets the loads raises at the stored load."""
     made = Press(wall=True)
     load = made.load
 
@@ -342,8 +345,8 @@ def test_a_load_that_fails_leaves_the_problem(saved):
     assert made.problem.increment == 0 and not np.any(owned(made.scene.u))
 
 
-def test_bodies_that_cover_one_another(tmp_path):
-    """Values at one place in cells of one middle: no file is begun that could not be read."""
+def test_coinciding_cells_cannot_be_saved(tmp_path):
+    """No file is written if values cannot be assigned: coinciding nodes in coinciding cells."""
     line = np.linspace(0.0, 1.0, 3)
     sides = {1: lambda x, _: np.isclose(x[:, 1], 0.0), 2: lambda x, _: np.isclose(x[:, 1], 1.0)}
     mesh, tags = boxes([[line, line]] * 2, sides)
@@ -361,13 +364,13 @@ def test_bodies_that_cover_one_another(tmp_path):
     assert contact.resultants().normal_force > 0.0 and not path.exists()
 
 
-# ---- calls that are no use -----------------------------------------------------------------------
+# ---- calls without effect ------------------------------------------------------------------------
 
 
-def test_increments_that_are_never_asked_for(caplog):
-    """A warning says that nothing was solved; none where something was, or nothing was to be.
+def test_increments_without_iteration_warn(caplog):
+    """A warning states that nothing was solved, unless an increment was or none was due.
 
-    It is in the log, too: FFCx hides Python's warnings where no logging has been set up.
+    It is logged, too: FFCx hides Python's warnings if no logging has been set up.
     """
     made = Press()
     with pytest.warns(RuntimeWarning, match="iterate over"):
@@ -401,7 +404,7 @@ def test_increments_that_are_never_asked_for(caplog):
     ],
 )
 def test_arguments_are_checked_at_the_call(arguments, words):
-    """Not when the first increment is asked for."""
+    """Arguments are checked by the call of `increments`, not by its first increment."""
     made = Press()
     arguments = {"load": made.load, "start": 0.0, "end": 1.0} | arguments
     call = lambda: fc.increments(made.problem, **arguments)  # noqa: E731

@@ -1,4 +1,4 @@
-"""Balance of a load by contact forces: a cone of rays, told apart from what lies outside."""
+"""Balance of a load by contact forces: whether it is in the cone of rays, or outside."""
 
 import numpy as np
 import pytest
@@ -13,11 +13,11 @@ pytestmark = pytest.mark.two_ranks
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 6])
-def test_inside_and_outside_of_a_cone(m):
-    """Rays in a half-space: sums of them are balanced, what points out of it never is.
+def test_forces_inside_and_outside_of_a_cone(m):
+    """Sums of rays in a half-space are balanced, forces that point out of it are not.
 
-    The distance from outside is at least the resultant's part along the half-space's normal w, for
-    Σ|w·rest| ≤ max|w| Σ|rest|.
+    The remainder of a force outside is at least its component along the half-space's normal w over
+    max|w|, because Σ|w·rest| ≤ max|w| Σ|rest|.
     """
     rng = np.random.default_rng(m)
     for _ in range(100):
@@ -35,10 +35,10 @@ def test_inside_and_outside_of_a_cone(m):
 
 @pytest.mark.each
 @pytest.mark.parametrize("needed", range(7))
-def test_one_ray_of_many_balances(needed):
-    """Some of many rays are tried first; the only one that makes the force may be any of them.
+def test_single_balancing_ray_of_many_is_found(needed):
+    """A part of the rays is tried first; the only one along the force may be any of them.
 
-    Without it there is nothing along the third axis, of which all is left.
+    Without it no ray has a component along the third axis, and the whole force remains.
     """
     rng = np.random.default_rng(needed)
     rays = np.vstack([rng.normal(size=(2, 50_001)), np.zeros(50_001)])
@@ -51,8 +51,8 @@ def test_one_ray_of_many_balances(needed):
 
 @pytest.mark.parametrize("n", [3, 5, 12])
 @pytest.mark.parametrize("above", [0.9, 1.01])
-def test_a_block_beside_its_friction_angle(n, above):
-    """Pushed along by less than μ times its weight a block can be held, by more it cannot."""
+def test_block_below_and_above_the_friction_limit(n, above):
+    """A force of less than μ times its weight on a block is balanced, a larger one is refused."""
     # A low block, so that it does not tip: the push acts at half its height.
     scene = block("quadrilateral", up=-1.0, side=0.3 * above, n=n, size=[1.0, 0.1])
     problem, _ = scene.problem(fc.Coulomb(0.3, k_n=1e5, k_t=1e5), [])
@@ -63,10 +63,11 @@ def test_a_block_beside_its_friction_angle(n, above):
 
 
 @pytest.mark.parametrize("n", [1, 2, 4])
-def test_a_block_tips_over_its_outermost_points(n):
-    """A block of height 2 on n facets of a floor, pushed at its top: over two Gauss points a facet.
+def test_tipping_limit_of_a_block(n):
+    """A block of height 2 on n facets with two Gauss points each is pushed at its top.
 
-    By statics it tips where the resultant leaves the points, 0.2113 of a facet from its edges.
+    By statics it tips, to 1 %, when the resultant leaves the outermost points, 0.2113 of a facet
+    from the edges.
     """
     body = stack("quadrilateral", (n,), (2.0,))
     push, weight = body.constant(0.0), 1e3

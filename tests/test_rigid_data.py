@@ -22,7 +22,7 @@ RNG = np.random.default_rng(3)
 
 @pytest.fixture(autouse=True)
 def same_numbers():
-    """Every test begins with the same random numbers, on every rank."""
+    """Start every test with the same random numbers, on every rank."""
     RNG.bit_generator.state = np.random.default_rng(3).bit_generator.state
 
 
@@ -30,13 +30,13 @@ def same_numbers():
 
 
 def star(n=9):
-    """A closed polyline with corners in and out."""
+    """Return a closed polyline with convex and concave corners."""
     points = circle(2 * n) * np.where(np.arange(2 * n) % 2, 0.45, 1.0)[:, None]
     return points, ring(2 * n)
 
 
 def stone(n=60):
-    """A convex body with random corners: triangles of all shapes."""
+    """Return a convex body with random corners and triangles of all shapes."""
     points = RNG.normal(size=(n, 3))
     points /= np.linalg.norm(points, axis=1)[:, None]
     points *= [1.0, 0.7, 0.5]
@@ -48,7 +48,7 @@ def stone(n=60):
 
 
 def bowl():
-    """A box with a pit: edges and corners that look inwards, where facets hide each other."""
+    """Return a box with a pit: concave edges and corners, where facets occlude each other."""
     points, facets = box((-1, -1, -1), (1, 1, 1))
     inner, hole = box((-0.5, -0.6, -0.4), (0.6, 0.5, 1))
     sides = [i for i, f in enumerate(facets) if set(f) != {4, 5, 7} and set(f) != {4, 7, 6}]
@@ -60,7 +60,7 @@ def bowl():
 
 
 def needles(n=40):
-    """A closed cylinder of long thin triangles, its axis oblique."""
+    """Return a closed cylinder of long thin triangles with an oblique axis."""
     low = np.column_stack([circle(n, 0.4), np.full(n, -1.0)])
     points = np.concatenate([low, low * [1, 1, -1], [[0, 0, -1], [0, 0, 1]]])
     i, j = ring(n).T
@@ -77,7 +77,7 @@ SURFACES = {"star": star, "stone": stone, "bowl": bowl, "needles": needles}
 
 
 def brute_distance(points, facets, x):
-    """Least distance from all facets: of all feet on planes, lines and corners that are within."""
+    """Return the least distance from all facets, to projections on planes, edges and corners."""
     corners = points[facets]
     least = np.full(len(x), np.inf)
     for corner in corners:
@@ -95,7 +95,7 @@ def brute_distance(points, facets, x):
 
 
 def winding(points, facets, x):
-    """How often the surface goes round a place: angles, or solid ones (van Oosterom, Strackee)."""
+    """Return the winding number at points: by angles, or solid angles (van Oosterom, Strackee)."""
     arms = points[facets][None] - x[:, None, None, :]
     if x.shape[1] == 2:
         a, b = arms[:, :, 0], arms[:, :, 1]
@@ -110,7 +110,7 @@ def winding(points, facets, x):
 
 
 def places(points, n=600):
-    """Near and far, inside and outside, and close to corners."""
+    """Return points near and far, inside and outside, and close to corners."""
     d = points.shape[1]
     wide = RNG.uniform(-1.6, 1.6, size=(n, d))
     near = points[RNG.integers(len(points), size=n)] + 0.02 * RNG.normal(size=(n, d))
@@ -119,8 +119,8 @@ def places(points, n=600):
 
 @pytest.mark.each
 @pytest.mark.parametrize("name", SURFACES)
-def test_distance_and_sign(name):
-    """Against all facets one by one, and the winding number: round-off, 1e-12."""
+def test_signed_distance_of_a_surface(name):
+    """Reference: the least distance from all facets, signed by the winding number; 1e-12."""
     points, facets = SURFACES[name]()
     surface, x = fc.RigidSurface(points, facets), places(points)
     found = surface.sample(x).distance
@@ -135,9 +135,9 @@ def test_distance_and_sign(name):
 @pytest.mark.each
 @pytest.mark.parametrize("name", [*SURFACES, "profile", "extruded", "turned"])
 def test_normal_and_curvature_are_derivatives(name):
-    """Against central differences over h = 1e-6, where these stay on one facet, edge or corner.
+    """Reference: central differences with h = 1e-6 that stay on one facet, edge or corner.
 
-    With the curvature 1/r their error is h²/r² and h²/r³; and round-off, by h: 1e-10.
+    With the curvature 1/r their error is h²/r² and h²/r³, plus round-off divided by h, 1e-10.
     """
     if name in SURFACES:
         points, facets = SURFACES[name]()
@@ -166,7 +166,7 @@ def test_normal_and_curvature_are_derivatives(name):
 
 
 def _wavy(name):
-    """A wavy closed profile, or made of it in space; and places."""
+    """Return a wavy closed profile, or one extruded or turned in space, and points."""
     t = 2 * np.pi * np.arange(80) / 80
     flat = circle(80) * (1 + 0.1 * np.cos(3 * t))[:, None]
     if name == "profile":
@@ -179,8 +179,8 @@ def _wavy(name):
     return fc.RigidProfile(half, closed=True, turned=((0, 0, 0), (0, 0, 1))), 1.5 * x
 
 
-def test_at_edges_and_corners():
-    """On a box: the normal is the pseudo-normal, the sign that of the side from which one comes."""
+def test_normal_and_curvature_at_edges_and_corners():
+    """On a box the normal is the pseudo-normal, and nearby points have the sign of their side."""
     points, facets = box((-1, -1, -1), (1, 1, 1))
     obstacle = fc.RigidSurface(points, facets)
     found = obstacle.sample(points)
@@ -194,15 +194,15 @@ def test_at_edges_and_corners():
         assert np.all(np.sign(obstacle.sample(x).distance) == side)
     off = obstacle.sample(np.array([[1.3, 1.4, 0.2], [2.0, 3.0, 3.0]]))
     assert close(off.distance, [0.5, 3.0], 1e-12)
-    # About the edge a circle of radius 0.5, about the corner a ball of radius 3.
+    # Around the edge, level sets are circles (radius 0.5); around the corner, spheres (radius 3).
     t = np.array([-0.8, 0.6, 0.0])
     assert close(off.curvature[0], np.outer(t, t) / 0.5, 1e-12)
     n = np.array([1.0, 2.0, 2.0]) / 3
     assert close(off.curvature[1], (np.eye(3) - np.outer(n, n)) / 3, 1e-12)
 
 
-def test_beside_an_open_surface_everything_is_outside():
-    """Above or below, where the border is closest the obstacle is not; behind the middle one is."""
+def test_points_beyond_the_border_of_an_open_surface_are_outside():
+    """Points closest to the border are outside, above or below it; those behind a facet inside."""
     floor = fc.RigidSurface([[1.0, 0.0], [-1.0, 0.0]], [[0, 1]])  # the obstacle is below
     x = np.array([[0.2, 0.3], [0.2, -0.3], [1.3, 0.4], [1.3, -0.4], [-1.0 - 1e-6, -0.5]])
     assert not floor.facets.closed
@@ -213,8 +213,8 @@ def test_beside_an_open_surface_everything_is_outside():
         assert close(found.normal[3], np.array([-0.6, 0.8]), 1e-9)
 
 
-def test_facets_of_a_ball_converge():
-    """The distance from a sphere: four times closer when edges are halved, here between 3 and 5."""
+def test_distance_of_a_faceted_ball_converges():
+    """When edges are halved, the error of the distance falls by a factor of four, within 3 to 5."""
     x = places(ball(1)[0], 300)
     x = x[np.linalg.norm(x, axis=1) > 0.3]
     exact = np.linalg.norm(x, axis=1) - 1
@@ -223,10 +223,11 @@ def test_facets_of_a_ball_converge():
     assert all(3.0 < a / b < 5.0 for a, b in pairwise(errors))
 
 
-def test_facets_halved_towards_a_smooth_surface():
-    """Of a ball distances come five times and normals three times closer with 16 times the facets.
+def test_halvings_approach_a_smooth_surface():
+    """With 16 times the facets, errors on a ball fall to 1/5 (distance) and 1/3 (normal).
 
-    A cylinder of 40 needles does, too, and its rim, while caps and a box stay as they are.
+    Distance errors on a cylinder of 40 needles and on its rim fall to 1/5; its caps, and a box,
+    remain flat (1e-12).
     """
     x = places(ball(1)[0], 300)
     x = x[np.linalg.norm(x, axis=1) > 0.3]
@@ -260,14 +261,14 @@ def test_facets_halved_towards_a_smooth_surface():
     assert close(parts.distance, whole.distance, 1e-12)
 
 
-def test_from_afar_and_from_nowhere():
-    """A diverged iterate takes no time: 1e-6 of distances of 1e8 and 1e60; and no points at all."""
+def test_distant_points_and_no_points():
+    """Distances up to 1e60, as of diverged iterates, are accurate to 1e-6; points may be empty."""
     x = RNG.normal(size=(2000, 3))
     x /= np.linalg.norm(x, axis=1)[:, None]
     surface = fc.RigidSurface(*ball(5))
     for away in (1e3, 1e8, 1e60):
         assert close(surface.sample(away * x).distance, away - np.ones(2000), 1e-6)
-    # A place at the origin is no division by zero.
+    # A point at the origin causes no division by zero.
     with np.errstate(all="raise"):
         assert fc.RigidSurface(*ball(1, 1e3)).sample(np.zeros((1, 3))).distance < 0
     nothing = surface.sample(np.empty((0, 3)))
@@ -277,7 +278,7 @@ def test_from_afar_and_from_nowhere():
 
 
 def test_many_points_and_facets():
-    """10,000 points against 131,072 triangles: distances of a ball to the height of its facets."""
+    """Distances of 10,000 points from a ball of 131,072 triangles, to the height of its facets."""
     obstacle = fc.RigidSurface(*ball(7))
     x = RNG.normal(size=(10_000, 3))
     x *= (RNG.uniform(0.95, 1.1, size=10_000) / np.linalg.norm(x, axis=1))[:, None]
@@ -285,10 +286,10 @@ def test_many_points_and_facets():
     assert np.abs(found.distance - np.linalg.norm(x, axis=1) + 1).max() < 1.1e-4
 
 
-def test_a_spline_through_points_of_a_circle():
-    """Distance of a cylinder to 1e-8, normals 1e-5 and curvature 1e-3, for 200 points a turn.
+def test_spline_through_points_of_a_circle():
+    """A spline with 200 points has distances of a circle to 1e-8, normals 1e-5, curvature 1e-3.
 
-    In space extruded along an oblique axis; and half of it, turned, is a ball, on its axis too.
+    So has its extrusion along an oblique axis, and half of it turned to a ball, on the axis too.
     """
     points, radius = circle(200, 0.8), 0.8
     axis = np.array([0.2, 1.0, 0.4]) / np.sqrt(1.2)
@@ -318,7 +319,7 @@ def test_a_spline_through_points_of_a_circle():
 
 @pytest.mark.parametrize("binary", [True, False])
 def test_stl_files(binary, tmp_path):
-    """Binary, though the header begins with "solid", or text: the same surface, in mm or in m."""
+    """Binary files, though the header begins with "solid", and text files are read, and scaled."""
     folder = shared_folder(tmp_path)
     points, facets = ball(2)
     if COMM.rank == 0:
@@ -327,7 +328,7 @@ def test_stl_files(binary, tmp_path):
     read = fc.RigidSurface.from_stl(folder / "ball.stl", scale=1e-3)
     x = places(points, 50)
     given = fc.RigidSurface(points, facets).sample(x)
-    # A binary file has single precision: half of 1.2e-7.
+    # A binary file has single precision: relative round-off 6e-8.
     allowed = 1e-6 if binary else 1e-12
     assert read.facets.closed and len(read.facets.facets) == len(facets)
     assert close(read.sample(x).distance, given.distance, allowed)
@@ -367,14 +368,14 @@ SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
         (lambda: fc.RigidProfile(SQUARE, extruded=(0, 0, 0)), "length zero"),
     ],
 )
-def test_bad_data(make, text):
-    """Refused with what was given and what to give."""
+def test_bad_data_is_refused(make, text):
+    """Bad data raise an error that states the value given and what is required."""
     with pytest.raises(ValueError, match=re.escape(text)):
         make()
 
 
-def test_data_of_another_dimension_or_rank():
-    """In the plane and on a mesh in space; and arrays that are not the same on all ranks."""
+def test_data_of_wrong_dimension_or_different_by_rank_are_refused():
+    """A plane profile on a 3D mesh, and arrays that differ between ranks, raise an error."""
     scene = rubber("tetrahedron", 1, n=(2, 1))
     law = fc.Frictionless(1e3)
     flat = fc.RigidProfile(circle(9), closed=True)

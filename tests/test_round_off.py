@@ -1,7 +1,7 @@
-"""Bodies that are carried far, much stiffer than what they touch: round-off excuses what it is.
+"""Bodies displaced far, much stiffer than their obstacle: only round-off is accepted.
 
-A displacement u of a body of the stiffness k has a round-off of its forces of about 1e-16 k u,
-which can be more than all forces of contact with a softer body.
+A displacement u of a body of stiffness k has a round-off of its forces of about 1e-16 k u, which
+may exceed all contact forces on a softer body.
 """
 
 from __future__ import annotations
@@ -31,7 +31,10 @@ WAYS = [
 
 
 def pressed(stiffness: float, carried: float, **options) -> tuple[Array, fc.Step]:
-    """The force of a block, E = 1, on a slab so many times stiffer, both carried along."""
+    """Return the contact force of a block, and the step.
+
+    The block, E = 1, is on a slab ``stiffness`` times as stiff; both are displaced by ``carried``.
+    """
     slab = Box((-0.5, -0.5), (2.0, 0.5), (6, 2), stiffness)
     scene = Beside({"slab": slab, "block": Box(n=(4, 4))})
     along = scene.bodies.constant(carried)
@@ -49,12 +52,12 @@ def pressed(stiffness: float, carried: float, **options) -> tuple[Array, fc.Step
 @pytest.mark.parametrize(
     ("stiffness", "carried"), [(1e6, 10.0), (1e8, 10.0), (1e9, 10.0), (1e12, 0.3)]
 )
-def test_a_soft_block_on_a_stiff_slab(stiffness, carried, options):
-    """Its force is as where nothing is carried, to 1e-8; where the slab's is inexact it is said.
+def test_soft_block_on_a_displaced_stiff_slab(stiffness, carried, options):
+    """The block's force is as without displacement, to 1e-8; an inexact slab is warned of.
 
-    What passed was 1e-2 of the force at 1e9, and more than all of it at 1e12: it was off by 0.25 to
-    6 %. The tolerance is 1e-9 of the forces; displacements of 10 have a round-off of 1e-15, of
-    1e-2 by which the block is pressed.
+    A residual of 1e-2 of the force at 1e9, and of more than all of it at 1e12, once passed: the
+    force was off by 0.25 to 6 %. The tolerance is 1e-9 of the forces; displacements of 10 have a
+    round-off of 1e-15, and the block is pressed by 1e-2.
     """
     expected, still = pressed(stiffness, 0.0, **options)
     with warnings.catch_warnings(record=True) as caught:
@@ -70,10 +73,11 @@ def test_a_soft_block_on_a_stiff_slab(stiffness, carried, options):
     assert step.iterations <= still.iterations + 1
 
 
-def test_a_stiff_slab_that_nothing_else_holds():
-    """Between two blocks, carried along: what presses on both of its sides cannot be told apart.
+def test_unconstrained_stiff_slab_between_blocks():
+    """A displaced slab between two blocks is refused if its equilibrium is round-off.
 
-    Refused, with the reason: its own equilibrium is round-off. Alike to the blocks it is right.
+    The forces on its two sides cannot be determined then, and the error states the reason. With the
+    stiffness of the blocks the forces balance, to 1e-8.
     """
 
     def between(stiffness):
@@ -99,11 +103,11 @@ def test_a_stiff_slab_that_nothing_else_holds():
 @pytest.mark.each
 @pytest.mark.parametrize("E", [1.0, 2e11])
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_a_load_that_a_sine_leaves_at_its_zeros(kinematics, E):
-    """1e-16 of its amplitude, on a body led by 0.3, is no load: as with a load of 0.
+def test_round_off_of_a_load_counts_as_zero(kinematics, E):
+    """A load of 1e-16 of its amplitude, at a zero of a sine, counts as zero.
 
-    It was compared with itself, and refused. What is left of it changes forces by round-off of
-    those before: 1e-12 of them.
+    It acts on a body displaced by 0.3. Its residual was once compared with this load itself, and
+    refused. Reference: a load of 0, to 1e-12 of the forces, the round-off of those before.
     """
 
     def forces(loads):
@@ -131,12 +135,11 @@ def test_a_load_that_a_sine_leaves_at_its_zeros(kinematics, E):
     assert np.abs(found - expected).max() <= 1e-12 * np.abs(expected).max()
 
 
-def test_unloaded_contact_forces_leave_their_round_off():
-    """A block between a cylinder and a floor, led back to where nothing presses: forces are 1e-12.
+def test_round_off_forces_after_unloading_are_accepted():
+    """A block between a cylinder and a floor is moved back until forces are 1e-12.
 
-    These are what errors of the forces before leave, and their round-off passes, without a word; no
-    more is left when it is held there. Reference: the block at rest has none, to 1e-9 of those
-    before.
+    They result from errors of the forces before, pass as round-off without a warning, and do not
+    grow when the block stays there. Reference: zero, to 1e-9 of the forces before.
     """
     scene = random_scenes.draw_small(940025, 940025 // random_scenes.FAMILY)
     scene = {name: value for name, value in scene.items() if name not in random_scenes.SAID}
@@ -157,11 +160,11 @@ def test_unloaded_contact_forces_leave_their_round_off():
 
 @pytest.mark.parametrize("E", [1.0, 1e3, 1e9])
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_forces_that_are_round_off_supply_no_energy(kinematics, E):
-    """A block is led to and fro on a floor that it touches, pressed by round-off of its place.
+def test_round_off_forces_supply_no_energy(kinematics, E):
+    """A block moves back and forth on a floor, pressed by the round-off of its position.
 
-    Friction of 1e-14 at one end of an increment, and none at the other, was told of as energy
-    supplied, 100 % of what is exchanged. Reference: there are no forces, to 1e-12 of E.
+    Friction of 1e-14 at one end of an increment, and zero at the other, was reported as energy
+    supplied, 100 % of the energy exchanged. Reference: zero forces, to 1e-12 of E.
     """
     scene = Beside({"block": Box(n=(4, 4))}, E=E)
     place = [scene.bodies.constant(0.0) for _ in range(2)]
@@ -180,7 +183,7 @@ def test_forces_that_are_round_off_supply_no_energy(kinematics, E):
 
 @pytest.mark.parametrize("options", WAYS, ids=["condensed", "lbfgs", "newton"])
 def test_a_load_is_removed_after_a_restart(options):
-    """A block above the floor, its top moved and moved back: at rest, to 40 eps of the motion.
+    """The top of a block above the floor is moved back: u is zero, to 40 eps of the motion.
 
     The exact solution is zero, so that all forces at the end are round-off of the forces at the
     start, 40 eps of these. If the round-off is estimated as zero after a restart, the tolerance is

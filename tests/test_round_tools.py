@@ -1,4 +1,4 @@
-"""Facets as long as a rigid obstacle is round have points enough to see its shape."""
+"""Facets as long as the radius of a rigid obstacle have enough points to resolve its shape."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RADIUS = 1.0
 
 
 def profile(middle):
-    """A circle as a spline, the obstacle on the left of its way."""
+    """Return a circle as a spline, with the obstacle to the left of its direction."""
     angle = np.linspace(0.0, 2 * np.pi, 40, endpoint=False)
     return fc.RigidProfile(
         middle + RADIUS * np.column_stack([np.cos(angle), np.sin(angle)]), closed=True
@@ -26,7 +26,7 @@ def profile(middle):
 
 
 def distance(middle):
-    """The same as a distance, whose radius nobody knows."""
+    """Return the circle as a signed distance, whose radius of curvature is not given."""
 
     def to(x):
         return ufl.sqrt((x[0] - middle[0]) ** 2 + (x[1] - middle[1]) ** 2) - RADIUS
@@ -43,7 +43,7 @@ SHAPES = {
 
 
 def forces(shape, length, *, quadrature=None, degree=1, **options):
-    """Normal forces of a tool 0.3 deep in a block, over two places of a facet of some length."""
+    """Return normal forces of a tool 0.3 deep at two positions along a facet, and the contact."""
     found = []
     for share in (0.0, 0.35):
         up = np.linspace(-5.0, 0.0, 4)
@@ -63,12 +63,12 @@ def forces(shape, length, *, quadrature=None, degree=1, **options):
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 @pytest.mark.parametrize("length", [1.0, 2.0])
 @pytest.mark.parametrize("shape", ["cylinder", "ball", "profile"])
-def test_facets_see_a_round_tool(shape, length, enforcement):
-    """As long as its radius, or twice that.
+def test_facets_resolve_a_round_tool(shape, length, enforcement):
+    """Facets have the length of the tool's radius, or twice that.
 
-    Reference: 40 points on a facet, to 4 %: with 4 or 8 of them one more or less touches. With two
-    points, or those of the nodes, it was up to 26 % by penalty, and by multipliers nothing at all
-    was touched in the middle of the longer ones.
+    Reference: 40 points on a facet, to 4 %, the effect of one more or less of 4 or 8 closed points.
+    With two points, or at nodes, the error was up to 26 % with penalty, and with multipliers no
+    point was closed in the middle of the longer facets.
     """
     found, contact = forces(shape, length, enforcement=enforcement)
     fine, _ = forces(shape, length, enforcement=enforcement, quadrature=78)
@@ -76,10 +76,10 @@ def test_facets_see_a_round_tool(shape, length, enforcement):
     assert np.all(np.abs(found / fine - 1) < 0.04)
 
 
-def test_points_stay_as_they_are_on_shorter_facets():
-    """Of a quarter of the radius, in a bore, on a plane; those asked for; and at nodes.
+def test_default_points_where_the_radius_is_resolved():
+    """Facets of a quarter of the radius, in a bore or on a plane have the default points.
 
-    References: p + 1 points on a facet, or its nodes with multipliers.
+    References: p + 1 points on a facet, or its nodes with multipliers. A given degree is used.
     """
 
     def points(obstacle, length=0.25, **options):
@@ -98,10 +98,10 @@ def test_points_stay_as_they_are_on_shorter_facets():
 
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
-def test_few_points_are_told_of(enforcement):
-    """Where the radius was not known, by what to give; and nothing where there are enough.
+def test_insufficient_points_cause_a_warning(enforcement):
+    """If the radius is not given, a warning proposes a degree; with enough points there is none.
 
-    Reference: with the degree that is told the force is that of 40 points, to 4 %.
+    Reference: with the proposed degree the force is that of 40 points, to 4 %.
     """
     with pytest.warns(UserWarning, match="as long as the radius of curvature") as told:
         forces("distance", 2.0, enforcement=enforcement)

@@ -1,4 +1,4 @@
-"""A rigid cone, in the plane a wedge, with a round tip."""
+"""`RoundedCone`: a rigid cone (2D: a wedge) with a round tip."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ ANGLE, RADIUS = np.deg2rad(60), 0.3
 
 
 def distance(x, tip, axis):
-    """Signed distance and normal by search among 10⁵ points of the generating curve, in numpy."""
+    """Return the signed distance, by a search among 10⁵ points of the generating curve in numpy."""
     axis = axis / np.linalg.norm(axis)
     arm = x - tip
     z = arm @ axis
@@ -30,16 +30,17 @@ def distance(x, tip, axis):
         nearest = np.argmin(np.linalg.norm(curve - point, axis=1))
         foot[i] = curve[nearest]
         found[i] = np.linalg.norm(point - foot[i])
-    # Above the curve, z(ρ), is inside.
+    # Points above the curve z(ρ) are inside.
     inside = z > np.interp(rho, curve[:, 0], curve[:, 1])
     return np.where(inside, -found, found)
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_gap_and_normal(cell):
-    """The distance from points of the generating curve, 1e-4 apart: exact to 1e-8.
+def test_gap_and_normal_are_those_of_the_generating_curve(cell):
+    """The gap is the distance from points of the generating curve, 1e-4 apart, to 1e-7.
 
-    The normal is minus the gradient of the gap, of length 1, and points to the obstacle.
+    The normal has length 1 and points to the obstacle: half of the gap along it halves the gap, to
+    1e-6.
     """
     scene = block(cell, n=5)
     d = scene.dim
@@ -50,15 +51,15 @@ def test_gap_and_normal(cell):
     gap, normal = (gathered(COMM, v) for v in (contact.gap, contact.values.normal))
     assert close(gap, distance(x, tip, axis), 1e-7, scale=1.0)
     assert close(np.linalg.norm(normal, axis=1), np.ones(len(x)), 1e-13)
-    # Half of the gap along the normal, half is left.
+    # A displacement of half the gap along the normal leaves half of the gap.
     halfway = x + gap[:, None] / 2 * normal
     assert close(distance(halfway, tip, axis), gap / 2, 1e-6, scale=1.0)
     assert np.ptp(np.arccos(np.clip(-normal @ axis / np.linalg.norm(axis), -1, 1))) > 0.3
 
 
 def pressed(obstacle, cell, **options):
-    """Force on a block that is pressed onto an obstacle and dragged, in small increments."""
-    # By default there are more points where the radius is smaller.
+    """Return the forces on a block pressed onto an obstacle and dragged in small increments."""
+    # By default there are more points if the radius is smaller.
     scene = block(cell, n=4, surface={"quadrature_degree": 4})
     d = scene.dim
     bcs = [scene.hold(TOP, i) for i in range(d)]
@@ -76,10 +77,10 @@ def pressed(obstacle, cell, **options):
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_the_tip_is_a_ball(cell):
-    """A blunt tip, which the flank does not reach: the forces are those of a `Ball`, to round-off.
+def test_contact_at_the_tip_has_the_forces_of_a_ball(cell):
+    """With contact at the tip only the forces are those of a `Ball`, to 1e-7.
 
-    Solved to 1e-9 of the load.
+    The solver's tolerance is 1e-9 of the load.
     """
     up = np.eye(dimension(cell))[-1]
     tip, radius = 0.45 * (1 - up), 8.0
@@ -88,20 +89,20 @@ def test_the_tip_is_a_ball(cell):
     assert np.abs(ball).max() > 1.0 and close(cone, ball, 1e-7)
 
 
-def test_the_flank_is_a_plane():
-    """Where the wedge is far wider than the block, its flank gives the forces of a `HalfSpace`."""
+def test_contact_at_the_flank_has_the_forces_of_a_half_space():
+    """With contact at the flank of a wide wedge the forces are those of a `HalfSpace`, to 1e-7."""
     angle = np.deg2rad(80)
     n = np.array([-np.cos(angle), np.sin(angle)])  # out of the left flank
     axis, radius = np.array([0.0, -1.0]), 0.1
-    # The corner (1, 0) of the block touches the flank 2 beside the tip's circle.
+    # The corner (1, 0) of the block touches the flank at a distance of 2 from the tip's circle.
     centre = np.array([1.0, 0.0]) - radius * n - 2.0 * np.array([-n[1], n[0]])
     wedge = pressed(fc.RoundedCone(centre - radius * axis, axis, angle, radius), "quadrilateral")
     plane = pressed(fc.HalfSpace((1.0, 0.0), n), "quadrilateral")
     assert np.abs(plane).max() > 1.0 and close(wedge, plane, 1e-7)
 
 
-def test_a_wedge_is_pressed_in_symmetrically():
-    """A sharp wedge in the middle: the force is upright, that of a fine `RigidProfile`, to 1e-4."""
+def test_wedge_has_the_force_of_a_fine_profile():
+    """A sharp wedge at the middle has a vertical force, that of a fine `RigidProfile`, to 1e-4."""
     tip, axis, radius, angle = np.array([0.5, -0.01]), np.array([0.0, -1.0]), 0.02, np.deg2rad(75)
     t = np.linspace(0, np.pi / 2 - angle, 50)
     arc = radius * np.column_stack([np.sin(t), np.cos(t) - 1])
@@ -116,8 +117,8 @@ def test_a_wedge_is_pressed_in_symmetrically():
     assert close(found[0], found[1], 1e-4)
 
 
-def test_what_is_refused():
-    """Angles beyond a right angle, a tip without radius, axes of the wrong size; by their names."""
+def test_invalid_arguments_are_refused():
+    """Errors for invalid half angles, radii, axes and tips state the name of the argument."""
     scene = block()
     given = {"tip": (0.5, -0.1), "axis": (0, -1), "half_angle": ANGLE, "radius": RADIUS}
     for name, value in (

@@ -1,9 +1,9 @@
-"""Forces of very different sizes, one after another and side by side.
+"""Forces of very different magnitude, in successive increments and on bodies in one mesh.
 
-References are the forces applied: what the floor bears is the load, whatever was before and
-whatever is beside it. A body held by contact alone bears it to the tolerance, 1e-9 of the forces of
-this increment (of its own), or of what ``accuracy`` asks for. By methods whose iterations end with
-a step that changes nothing it is far less.
+References are the applied forces: the contact force is the load, independently of earlier
+increments and of other bodies. On a body constrained by contact alone it agrees to the tolerance,
+1e-9 of the body's forces in this increment, or to that set by ``accuracy``. With methods whose
+iterations end with a step of zero the error is far smaller.
 """
 
 import numpy as np
@@ -23,19 +23,20 @@ pytestmark = pytest.mark.two_ranks
 
 
 def may_take_long(*, refused: bool) -> None:
-    """On all unknowns what may be refused takes thousands of iterations."""
+    """Skip on several ranks: a refusal by the uncondensed system takes thousands of iterations."""
     if refused and COMM.size > 1:
         pytest.skip("takes minutes on several ranks")
 
 
-# ---- one after another ---------------------------------------------------------------------------
+# ---- successive increments -----------------------------------------------------------------------
 
 
 def touched_again(level, small, *, accuracy=None, cell="triangle", **options):
-    """Press with ``level``, release, touch with ``small``, shear by a fifth of that: the forces.
+    """Press with ``level``, release, press with ``small``, shear by a fifth; return the forces.
 
-    The material is such that the heavy load compresses it by 1 %. It stays where it is released,
-    off its first place: forces of that displacement have the round-off that is returned last.
+    The material is such that the heavy load compresses it by 1 %. The body stays where it is
+    released, displaced from its initial position; the round-off of the forces there is returned,
+    too.
     """
     E = 100 * level
     scene = block(cell, n=4, E=E)
@@ -55,11 +56,11 @@ def touched_again(level, small, *, accuracy=None, cell="triangle", **options):
 @pytest.mark.each
 @pytest.mark.parametrize("accuracy", [None, "draft", "standard", "fine"])
 @pytest.mark.parametrize("level", [10.0, 1e3, 1e7, 1e10])
-def test_a_light_touch_after_a_heavy_one(level, accuracy):
-    """The forces of earlier increments are no measure of those of this one.
+def test_small_load_after_a_large_one(level, accuracy):
+    """Tolerances do not depend on the forces of earlier increments.
 
-    One that is 1e11 times lighter, near the round-off of what was before, may be refused. If not
-    its forces are right to ten times the round-off of where the body was left.
+    A load 1e11 times smaller, near the round-off of the earlier one, may be refused. Otherwise its
+    forces are correct to the tolerance and ten times the round-off of the body's position.
     """
     may_take_long(refused=level >= 1e7)
     small = 1e-4
@@ -77,14 +78,14 @@ def test_a_light_touch_after_a_heavy_one(level, accuracy):
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("condensation", [None, False])
-def test_a_light_touch_by_every_method(method, condensation):
+def test_small_load_after_a_large_one_with_every_method(method, condensation):
     (*_, sheared), _ = touched_again(1e3, 1e-4, method=method, condensation=condensation)
     assert np.abs(sheared - [-0.2e-4, 1e-4]).max() <= 1e-8 * 1e-4
 
 
 @pytest.mark.parametrize("drop", [1e-3, 1e-8, 1e-12])
-def test_a_load_that_falls_in_one_increment(drop):
-    """With no release in between; where the increment's own round-off begins it may be refused."""
+def test_load_reduced_in_one_increment(drop):
+    """The load is not released in between; at the round-off of the increment it may be refused."""
     may_take_long(refused=drop == 1e-12)
     scene = block("quadrilateral", n=4)
     problem, contact = scene.problem(fc.Coulomb(0.3), [])
@@ -100,13 +101,13 @@ def test_a_load_that_falls_in_one_increment(drop):
     assert np.abs(force - [0.1 * drop, drop]).max() <= 1e-8 * drop + 1e-14
 
 
-# ---- side by side --------------------------------------------------------------------------------
+# ---- bodies in one mesh --------------------------------------------------------------------------
 
 
 def beside(ratio, *, one_contact=False, joined=False, friction=0.5, **options):
-    """Two boxes on a floor, loaded by 10 and 10/ratio, then sheared by a fifth of that; forces.
+    """Press two boxes on a floor by 10 and 10/ratio, shear by a fifth; return loads, forces, step.
 
-    ``one_contact``: one Γc of both. ``joined``: one body with two feet instead.
+    ``one_contact``: one Γc of both. ``joined``: unused.
     """
     axes = [
         [np.linspace(0, 1, 4), np.linspace(0, 1, 4)],
@@ -150,8 +151,8 @@ def beside(ratio, *, one_contact=False, joined=False, friction=0.5, **options):
 @pytest.mark.parametrize("one_contact", [False, True])
 @pytest.mark.parametrize("method", [None, "lbfgs", "newton"])
 @pytest.mark.parametrize("ratio", [1e3, 1e4, 1e8])
-def test_a_light_body_beside_a_heavy_one(ratio, method, one_contact):
-    """Every body bears its own load, as exactly as if it were alone."""
+def test_lightly_loaded_body_next_to_a_heavily_loaded_one(ratio, method, one_contact):
+    """The contact force on every body is its own load, to 1e-8 of this load."""
     loads, found, step = beside(ratio, method=method, one_contact=one_contact)
     for load, force in zip(loads, found, strict=True):
         assert np.abs(force - [-0.2 * load, load]).max() <= 1e-8 * load
@@ -160,11 +161,11 @@ def test_a_light_body_beside_a_heavy_one(ratio, method, one_contact):
     assert not step.verdict.failures
 
 
-def test_a_body_out_of_balance_is_named():
-    """One whose residual is large by its own forces fails, small as it is beside the others'."""
+def test_unbalanced_body_is_named():
+    """A residual that is large relative to the body's own forces, not to others', fails."""
     *_, step = beside(1e8)
     verdict = step.verdict
-    light = verdict.equations["body 2"]  # they are numbered along x
+    light = verdict.equations["body 2"]  # bodies are numbered along x
     assert light.force < 1e-6
     broken = fc.ForceBalance(1e-3 * light.force, light.force, light.tolerance)
     equations = verdict.equations | {"body 2": broken}
@@ -173,11 +174,12 @@ def test_a_body_out_of_balance_is_named():
 
 
 @pytest.mark.parametrize("condensation", [None, False])
-def test_a_soft_body_beside_a_stiff_one(condensation):
-    """What passes on a body is a share of its own forces, whatever is as stiff as 1e8 times it.
+def test_tolerance_of_a_soft_body_next_to_a_stiff_one(condensation):
+    """The tolerance of a body is relative to its own forces, next to one 1e8 times as stiff.
 
-    Both are held at their tops and pressed on a floor by 1e-3 of their height. The solver is asked
-    for 1e-9 of the forces; the round-off of the stiff body is more than that of the soft one's.
+    Both have Dirichlet conditions at their tops and are pressed on a floor by 1e-3 of their height.
+    The tolerance is 1e-9 of the forces; the round-off of the stiff body exceeds this fraction of
+    the forces on the soft one.
     """
     lines = np.linspace(0, 1, 4)
     sides = {
@@ -195,19 +197,19 @@ def test_a_soft_body_beside_a_stiff_one(condensation):
         body.contact(tag, floor, fc.Coulomb(0.3), name=f"floor {tag}") for tag in (FLOOR, FLOOR_2)
     ]
     step = body.problem(*contacts, condensation=condensation).solve()
-    soft = step.verdict.equations["body 2"]  # they are numbered along x
+    soft = step.verdict.equations["body 2"]  # bodies are numbered along x
     assert 1e-4 < soft.force < 1e-2
     assert soft.tolerance == pytest.approx(1e-9 * soft.force, rel=1e-6)
 
 
-# ---- numbers that are none -----------------------------------------------------------------------
+# ---- numbers that are not finite -----------------------------------------------------------------
 
 
 @pytest.mark.each
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("place", ["residual", "force", "tolerance"])
-def test_what_is_not_finite_does_not_pass(place, value):
-    """Not even an infinite residual below an infinite tolerance."""
+def test_residuals_that_are_not_finite_fail(place, value):
+    """Even an infinite residual below an infinite tolerance fails."""
     numbers = {"residual": np.inf if value == np.inf else 0.0, "force": 1.0, "tolerance": np.inf}
     numbers[place] = value
     broken = fc.ForceBalance(**numbers)
@@ -218,8 +220,8 @@ def test_what_is_not_finite_does_not_pass(place, value):
 
 
 @pytest.mark.parametrize("E", [1e100, 1e200, 1e300])
-def test_a_modulus_beyond_all_measure(E):
-    """The load is borne, or the increment is refused; never an answer without force."""
+def test_huge_modulus_is_solved_or_refused(E):
+    """The contact force is the load, to 1e-8, or the increment is refused."""
     scene = block("quadrilateral", E=E, up=-1.0)
     problem, contact = scene.problem(fc.Frictionless(), scene.rollers())
     try:

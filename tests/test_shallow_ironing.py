@@ -23,10 +23,10 @@ SIZES = np.array([0.4, 0.283, 0.2, 0.141])
 EXACT = {"V(1)": 300.0, "V(1.5)": 380.0, "H(1.5)": 120.0}
 
 
-# ---- what is stored ------------------------------------------------------------------------------
+# ---- stored runs ---------------------------------------------------------------------------------
 
 
-def test_every_run_is_there() -> None:
+def test_every_setting_has_a_stored_run() -> None:
     """Every setting has one row without failure."""
     rows = study.stored(study.STUDY)
     assert {row["name"] for row in rows} == set(study.settings()) and not any(
@@ -55,7 +55,7 @@ def test_page_follows_from_stored_rows() -> None:
 
 @pytest.mark.parametrize("times", ["twice", "half"])
 @pytest.mark.parametrize("quantity", page.QUANTITIES)
-def test_meshes_apart_move_no_more_than_the_error(quantity: str, times: str) -> None:
+def test_mesh_of_the_die_changes_forces_less_than_the_error(quantity: str, times: str) -> None:
     """Refining or coarsening the die alone changes the forces by less than their errors."""
     rows = study.results()
     moved = page.differences(rows, quantity)[f"cells of the die {times} as large{page.COARSE}"]
@@ -63,7 +63,7 @@ def test_meshes_apart_move_no_more_than_the_error(quantity: str, times: str) -> 
     assert 0.0 < abs(moved) < error
 
 
-def test_the_demo_has_the_spread_that_is_published() -> None:
+def test_demo_has_the_published_range() -> None:
     """The range of the five published results is that of the demo."""
     for i, key in enumerate([(1.0, "V"), (1.5, "V"), (1.5, "H")]):
         values = [points[i] for points in page.PUBLISHED.values()]
@@ -72,7 +72,7 @@ def test_the_demo_has_the_spread_that_is_published() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["size 0.4", f"80 increments of pressing{page.COARSE}"])
-def test_runs_are_repeated(name: str) -> None:
+def test_runs_are_reproduced(name: str) -> None:
     """Forces are reproduced to 1e-6, with residuals of 1e-9."""
     (row,) = (row for row in study.stored(study.STUDY) if row["name"] == name)
     found, _ = study.run(study.settings()[name])

@@ -1,4 +1,4 @@
-"""What notebooks show: well-formed tables with the object's numbers, and no markup of a name's."""
+"""HTML tables for notebooks are well-formed, have the object's values, and escape names."""
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
@@ -18,7 +18,7 @@ NAME = "<b>one & two</b>"
 
 @pytest.fixture(scope="module")
 def solved():
-    """A block slipped to and fro, under a name that would be markup, and its last step."""
+    """Return a block moved back and forth, with markup as contact name, and its last step."""
     made = Rub(contact={"name": NAME}, degree=2)
     made.problem.small_displacement_tolerance = np.inf
     *_, step = fc.increments(made.problem, made.load, 0, 2, steps=4, estimate=True)
@@ -26,7 +26,7 @@ def solved():
 
 
 def table(thing):
-    """Title, rows and lines below, by a parser of XML."""
+    """Return title, rows and paragraphs of the table of an object, by an XML parser."""
     root = ElementTree.fromstring(f"<div>{thing._repr_html_()}</div>")
     rows = [[cell.text for cell in row] for row in root.iter("tr")]
     assert len({len(row) for row in rows}) == 1
@@ -34,8 +34,8 @@ def table(thing):
     return root.find(".//caption").text, rows, [p.text for p in root.iter("p")]
 
 
-def test_a_step(solved):
-    """Its summary and its table tell the resultant and the sum of sizes apart."""
+def test_table_of_a_step(solved):
+    """Summary and table of a step have both the resultant and the integral of friction ∫|τ|."""
     _, step = solved
     r = step.contacts[NAME]
     title, (header, row), (remark, *left_out, units) = table(step)
@@ -52,7 +52,7 @@ def test_a_step(solved):
         str(n) for n in (r.stick, r.slip, r.open)
     ]
     assert remark.startswith(f"{step.method}: ")
-    # Friction is against the motion everywhere here, and the ball's flanks press aside.
+    # Friction opposes the motion everywhere, and the ball's flanks have horizontal pressure.
     text = step.summary()
     assert (
         f"friction ∫|τ| {r.tangential_force:.6g}, resultant {shown['resultant on the body']}"
@@ -69,15 +69,15 @@ def test_a_step(solved):
         (7, "7 iterations"),
     ],
 )
-def test_iterations_are_told_in_words(solved, iterations, told):
-    """By the line and by the table alike."""
+def test_iterations_of_a_step_in_words(solved, iterations, told):
+    """Summary and table state the number of iterations in the same words."""
     step = replace(solved[1], iterations=iterations, method="newton")
     for text in (step.summary(), table(step)[2][0]):
         assert f"newton: {told}; residual" in text
 
 
-def test_a_verdict(solved):
-    """Every condition with its error and limit; failures below."""
+def test_table_of_a_verdict(solved):
+    """The table has every condition with its error and limit, and failures below."""
     made, step = solved
     title, rows, remarks = table(step.verdict)
     assert title == "Verdict: holds" and remarks == []
@@ -97,8 +97,8 @@ def test_a_verdict(solved):
     assert title == "Verdict: does not hold" and remarks == error.value.verdict.failures
 
 
-def test_an_error_budget(solved):
-    """The cells are those of the text; the last row is all parts together."""
+def test_table_of_an_error_budget(solved):
+    """The cells are those of the text; the last row is the total of all parts."""
     made, step = solved
     scene = made.scene
     tensor = stress(scene.u, scene.E, scene.nu)
@@ -116,6 +116,6 @@ def test_an_error_budget(solved):
 
 
 @pytest.mark.parametrize(("number", "words"), [(0, "0 iterations"), (1, "1 iteration")])
-def test_attempts_are_told_in_words(number, words):
-    """One iteration is one, in messages, logs and reports."""
+def test_iterations_of_an_attempt_in_words(number, words):
+    """The text of an attempt has the singular for one iteration."""
     assert str(Attempt("newton", number, "converged")) == f"newton: converged ({words})"

@@ -1,4 +1,4 @@
-"""Signatures of laws and obstacles: other code is told apart, and nothing else."""
+"""Signatures of laws and obstacles differ if and only if their code differs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.two_ranks, pytest.mark.newest]
 
 
 def made(power=1.0, factor=1.0):
-    """A class of laws by the code of its friction bound; all have one name and parameters."""
+    """Return a law class with this friction bound; name and parameters are always the same."""
 
     @dataclass(frozen=True)
     class Rubber(fc.Coulomb):
@@ -32,18 +32,18 @@ def made(power=1.0, factor=1.0):
 
 @dataclass(frozen=True)
 class Fixed(fc.Law):
-    """Written here in full, so that its signature is that of no code of the package."""
+    """A law whose signature does not depend on code of the package."""
 
     k_n: float
     k_t: float
 
     @property
     def has_tangential(self):
-        """It has, without friction."""
+        """Whether the law has tangential tractions: yes, without friction."""
         return True
 
     def contact_traction(self, kinematics, parameters):
-        """Springs in both directions, the tangential ones where the gap is closed."""
+        """Return the traction of springs, tangential ones only where the gap is closed."""
         n, u_t = kinematics.normal, kinematics.tangential_displacement
         closing = -kinematics.gap
         across = ufl.Identity(len(n)) - ufl.outer(n, n)
@@ -53,16 +53,16 @@ class Fixed(fc.Law):
         return fc.ContactTraction(-parameters["k_n"] * penetration, traction)
 
     def stored(self, kinematics, response, parameters):
-        """Of no matter here."""
+        """Return an arbitrary stored energy, not used here."""
         return ufl.max_value(-kinematics.gap, 0) ** 2
 
     def tangential_stiffness(self, kinematics, parameters):
-        """Of no matter here."""
+        """Return an arbitrary tangential stiffness, not used here."""
         return parameters["k_t"] * ufl.Identity(len(kinematics.normal))
 
 
-def test_it_is_the_same_in_every_process_and_release():
-    """Noted with DOLFINx 0.9 and 0.11: whatever was made before, on any rank."""
+def test_signature_is_the_same_in_every_process_and_release():
+    """Signatures recorded with DOLFINx 0.9 and 0.11 do not depend on rank or earlier objects."""
     mesh = block("quadrilateral").mesh
     noted = {2: "0ac21b49b020c115", 3: "d1a42274494171b5"}
     for _ in range(1 + 7 * COMM.rank):
@@ -72,14 +72,14 @@ def test_it_is_the_same_in_every_process_and_release():
             assert signature_of_law(Fixed(1.0, 1.0), gdim, multipliers=False) == word
 
 
-def test_laws_are_told_apart_by_their_code():
-    """By bound, polygon, dimension and multipliers; not by the values of parameters."""
+def test_signatures_of_laws_depend_on_their_code_only():
+    """They depend on bound, polygon, dimension and multipliers, not on parameter values."""
     laws = [fc.Coulomb(0.3), fc.Coulomb(0.3, modes=4), fc.Coulomb(0.3, modes=5)]
     laws += [made()(0.3), made(power=0.9)(0.3), made(factor=1.01)(0.3)]
     laws += [fc.Tresca(0.3, 1.0), fc.Tresca(0.3, 1.0, unilateral=False)]
     laws += [fc.Foundation(1.0, 1.0), fc.Foundation(1.0, 1.0, tension=False), fc.Frictionless()]
     words = [signature_of_law(law, 3, multipliers=False) for law in laws]
-    # A factor and an exponent of one are none.
+    # A factor and an exponent of one do not change the code.
     assert words[3] == words[0] and len(set(words)) == len(words) - 1
     assert words == [signature_of_law(law, 3, multipliers=False) for law in laws]
     assert signature_of_law(laws[0], 2, multipliers=False) != words[0]
@@ -87,8 +87,8 @@ def test_laws_are_told_apart_by_their_code():
     assert signature_of_law(fc.Coulomb(0.7, 1e3, 1e2), 3, multipliers=False) == words[0]
 
 
-def test_a_long_chain():
-    """An obstacle of 3000 terms, one in the other, is no matter to Python's stack."""
+def test_signature_of_a_deeply_nested_expression():
+    """An obstacle of 3000 nested terms does not exceed Python's recursion limit."""
 
     def distance(x):
         found = x[0]
@@ -100,8 +100,8 @@ def test_a_long_chain():
 
 
 @pytest.mark.parametrize("other", [made(power=0.99), made(factor=1.001)])
-def test_a_checkpoint_of_other_code_is_refused(other, tmp_path):
-    """The class has the same name and parameters; the same code made again goes on."""
+def test_checkpoint_of_a_law_with_other_code_is_refused(other, tmp_path):
+    """A law of the same name and parameters but other code is refused; the same code continues."""
     path, options = shared_folder(tmp_path) / "state.npz", {"friction": 0.3, "k_n": 2e4, "k_t": 1e4}
     first = Press(made()(**options))
     for step in first.increments(checkpoint=path):
@@ -116,8 +116,8 @@ def test_a_checkpoint_of_other_code_is_refused(other, tmp_path):
     assert next(told.increments(checkpoint=path, on_mismatch="continue")).increment == 4
 
 
-def test_a_checkpoint_of_an_obstacle_of_other_shape_elsewhere_is_refused(tmp_path):
-    """With finite kinematics bodies go to where two obstacles differ that are one at Γc."""
+def test_checkpoint_of_an_obstacle_that_differs_off_contact_is_refused(tmp_path):
+    """Finite kinematics may reach positions where obstacles differ that are equal near Γc."""
     path = shared_folder(tmp_path) / "state.npz"
 
     def history(height):

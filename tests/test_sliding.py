@@ -1,4 +1,4 @@
-"""Slip over many facets of the opposite body: the pairs are found anew at every increment."""
+"""Slip over many facets of the opposing body, with pairs updated at every increment."""
 
 import numpy as np
 import pytest
@@ -16,22 +16,22 @@ pytestmark = pytest.mark.two_ranks
 
 @pytest.mark.parametrize("update", ["increment", "auto"])
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
-def test_found_where_the_body_has_gone(cell, update):
-    """A block that was carried over the base and then pressed is one that stood there before.
+def test_pairs_follow_a_displaced_body(cell, update):
+    """A block displaced over the base and then pressed agrees with one meshed at that position.
 
-    Both solve the same equations, to the solver's tolerance.
+    Both solve the same equations: pressures to 1e-7, by the solver's tolerance.
     """
     n = (14, 4) if cell in ("triangle", "quadrilateral") else (7, 2)
     law = fc.Frictionless(k_n=K_N)
     carried, standing = (Slider(cell, law, start=s, n=n, update_pairs=update) for s in (0.4, 1.73))
-    carried.step(-0.01, 1.33)  # lifted, so that nothing touches
+    carried.step(-0.01, 1.33)  # lifted, without contact
     assert carried.contact.resultants().normal_force == 0.0
     carried.step(0.002, 1.33)
     standing.step(0.002, 0.0)
     assert standing.contact.resultants().normal_force > 0
     a, b = carried.contact.gather(), standing.contact.gather()
     assert close(a["pressure"], b["pressure"], 1e-7)
-    # Without the update the pairs would still be those of the start: that is refused, or said.
+    # Without the update the pairs are those of the start: this is refused, or causes a warning.
     held = Slider(cell, law, start=0.4, n=n, update_pairs="never")
     held.step(-0.01, 1.33)
     with pytest.raises(fc.NotConverged, match="small-displacement"):
@@ -44,10 +44,10 @@ def test_found_where_the_body_has_gone(cell, update):
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
-def test_steady_sliding(cell, method):
-    """Dragged over five facets of the base: T = μN at every step, and N hardly changes.
+def test_steady_sliding_has_the_tangential_force_of_the_law(cell, method):
+    """Dragged over five facets of the base: T = μN in every increment, and N is almost constant.
 
-    So far from its ends N would not change at all but for the facets of the base: 1 %.
+    Far from the ends of the base N changes only by its facets: 1 %.
     """
     made = Slider(cell, fc.Coulomb(0.3, k_n=K_N, k_t=K_N), start=0.8, method=method)
     made.step(0.002, 0.0)
@@ -61,12 +61,12 @@ def test_steady_sliding(cell, method):
         assert step.energy.dissipation > 0
     normal = np.array(normal[3:])
     assert np.abs(normal / normal.mean() - 1).max() < 0.01
-    # The friction's work over each step is T times the way, slip being all of it when steady.
+    # In steady sliding slip equals the displacement: friction dissipates T times it per increment.
     assert close(step.energy.dissipation, 0.3 * normal[-1] * 0.1, 0.01)
 
 
-def test_traction_stays_with_the_points():
-    """Sticking points whose pairs are found anew keep their traction: nothing creeps."""
+def test_sticking_points_keep_their_traction_when_pairs_are_updated():
+    """Sticking points keep their traction when their pairs are updated: there is no creep."""
     made = Slider("quadrilateral", fc.Coulomb(5.0, k_n=K_N, k_t=K_N), start=1.1)
     made.step(0.002, 0.0)
     made.step(0.002, 1e-4)
@@ -79,8 +79,8 @@ def test_traction_stays_with_the_points():
     assert made.contact.resultants().stick > 0
 
 
-def test_off_the_edge_points_are_open_and_counted():
-    """Points pushed past the end of the base have no opposite any more."""
+def test_points_beyond_the_edge_are_open_and_counted():
+    """Points displaced beyond the end of the base have no opposite point any more."""
     made = Slider("quadrilateral", fc.Frictionless(k_n=K_N), start=2.7)
     made.step(0.002, 0.0)
     assert made.contact.n_unpaired == 0
@@ -91,12 +91,12 @@ def test_off_the_edge_points_are_open_and_counted():
 
 
 @pytest.mark.parametrize("condensation", [None, False])
-def test_by_default_found_anew_once_points_slid_by_a_facet(condensation):
-    """Pairs stay while points slip little, as with "never", and follow from then on.
+def test_default_updates_pairs_after_slip_by_a_facet(condensation):
+    """Pairs are not updated while the slip is small, as with "never", and in every increment later.
 
-    The facets of Γc are 0.25 long: a way of 0.2 is less than that, one of 0.3 is more.
-    What comes then is what the same steps give that were followed from the start, to what the
-    pairs of the first few differ by: the facets of both match in size, 1e-3.
+    The facets of Γc are 0.25 long: a displacement of 0.2 is less than that, one of 0.3 is more.
+    From then on the forces are those of pairs updated from the start, to 1e-3, the effect of
+    different pairs in the first increments: the facets of both bodies are equal in size.
     """
     law = fc.Coulomb(0.3, k_n=K_N, k_t=K_N)
     ways = [0.0, 0.2, 0.3, 0.4, 0.5]
@@ -126,8 +126,8 @@ def test_by_default_found_anew_once_points_slid_by_a_facet(condensation):
     assert close(auto[3:], increment[3:], 1e-3)
 
 
-def test_found_anew_where_the_field_lags():
-    """Where u may stay behind it is brought up for the search, and nothing else is found."""
+def test_pair_update_recovers_the_interior_displacement():
+    """Without recovery in every increment, u is recovered for the search: equal forces, 1e-9."""
     law = fc.Coulomb(0.3, k_n=K_N, k_t=K_N)
     forces = []
     for field in (True, False):
@@ -143,8 +143,8 @@ def test_found_anew_where_the_field_lags():
     assert close(np.array(forces[1]), np.array(forces[0]), 1e-9)
 
 
-def test_update_has_three_values():
-    """Anything else is refused."""
+def test_unknown_update_of_pairs_is_refused():
+    """``update_pairs="step"`` is refused."""
     mesh, tags = two_blocks("triangle", (3, 4))
     assert mesh is not None
     raised_everywhere(

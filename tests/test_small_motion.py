@@ -1,7 +1,7 @@
-"""Displacements are taken as small: what that leaves out is told, warned of, and refused.
+"""Small-displacement error: its estimate, the warning and the failure.
 
-The reference is the same scene with the other one moved: to drag the obstacle is exact, since its
-gap and normals are those of where it is; to drag the body as far the other way is not.
+The reference is the same scene with the obstacle dragged instead of the body: its gap and normals
+are those of its current position, which is exact; those of the dragged body are not.
 """
 
 import warnings
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.two_ranks
 def pressed(
     cell="quadrilateral", *, body=0.0, obstacle=0.0, small_displacement_tolerance=np.inf, **options
 ):
-    """A block on a cylinder or ball, pressed down by a prescribed way, one of them moved."""
+    """Return a block pressed on a cylinder or ball by Dirichlet values, one of them dragged."""
     scene = block(cell, n=8 if cell == "quadrilateral" else 3, size=(2.0,) * options.pop("d", 2))
     d = scene.dim
     center = np.full(d, 1.0)
@@ -59,8 +59,8 @@ def solved(**scene):
 
 @pytest.mark.parametrize("options", [{}, {"condensation": False, "method": "lbfgs"}])
 @pytest.mark.parametrize("way", [0.05, 0.2])
-def test_what_dragging_the_body_leaves_out_is_told(way, options):
-    """The estimate is the difference to the dragged obstacle, within a half of it."""
+def test_estimate_is_the_difference_to_the_dragged_obstacle(way, options):
+    """The estimate agrees with the difference to the dragged obstacle within a factor of two."""
     told, dragged = solved(body=-way, **options)
     nearly, exact = solved(obstacle=way, **options)
     missing = np.abs(dragged - exact).max() / np.linalg.norm(dragged)
@@ -69,8 +69,8 @@ def test_what_dragging_the_body_leaves_out_is_told(way, options):
     assert missing > 0.005
 
 
-def test_a_flat_obstacle_leaves_nothing_out():
-    """However far the body slides along it."""
+def test_plane_has_no_small_displacement_error():
+    """A body may slide far along a plane: the error is at most 1e-12."""
     scene = block("quadrilateral", n=4, up=-10.0)
     problem, contact = scene.problem(fc.Coulomb(0.1), [scene.hold(TOP, 0, 30.0)])
     step = problem.solve()
@@ -80,8 +80,8 @@ def test_a_flat_obstacle_leaves_nothing_out():
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_the_true_gap(cell):
-    """Distance from the ball's surface at X + u, and the direction to its centre."""
+def test_gap_and_normal_at_the_deformed_position(cell):
+    """`true_placement` gives distance and direction to the ball at X + u, to 1e-12."""
     d = 2 if cell == "quadrilateral" else 3
     problem, contact = pressed(cell, d=d, body=0.3)
     problem.u.interpolate(lambda x: np.stack([0.1 + 0.05 * x[0] - 0.02 * x[i] for i in range(d)]))
@@ -96,7 +96,7 @@ def test_the_true_gap(cell):
     assert close(at_points(contact, normal), at_points(contact, -arm / length[:, None]), 1e-12)
 
 
-def test_motion_that_is_not_small_fails():
+def test_large_displacement_fails():
     problem, contact = pressed(body=-1.0, small_displacement_tolerance=0.2)
     with pytest.raises(fc.NotConverged, match="too large for the small-displacement"):
         problem.solve()
@@ -104,10 +104,10 @@ def test_motion_that_is_not_small_fails():
 
 
 @pytest.mark.parametrize("condensation", [None, False])
-def test_a_stiffness_in_other_units_fails(condensation):
-    """On a plane gap and normal are exact, but no block is pressed down by more than its size.
+def test_deformation_by_a_stiffness_in_wrong_units_fails(condensation):
+    """A block deformed by over ten times its size fails, although gap and normal are exact.
 
-    Who says so gets the solution; and a top that is moved by as much takes the block along.
+    It is accepted with an infinite tolerance; a large Dirichlet value moves the block rigidly.
     """
 
     def pushed(E, top=0.0, **options):
@@ -122,8 +122,8 @@ def test_a_stiffness_in_other_units_fails(condensation):
     assert pushed(1e6, top=50.0).verdict.deformation["the body"] < 0.1
 
 
-def test_motion_that_is_hardly_small_is_warned_of_as_it_grows():
-    """Once for each doubling; every summary has it."""
+def test_small_displacement_warning_is_repeated_at_each_doubling():
+    """The warning is repeated when the error has doubled; every summary above 1 % states it."""
     problem, _ = pressed(body=-0.2, small_displacement_tolerance=0.5)
     with pytest.warns(UserWarning, match="assumed small") as caught:
         step = problem.solve()
@@ -152,14 +152,14 @@ def test_motion_that_is_hardly_small_is_warned_of_as_it_grows():
     assert max(shares) <= 2 * warned[-1]
 
 
-# ---- in any frame --------------------------------------------------------------------------------
+# ---- rotated scene -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("angle", [30.0, 45.0])
-def test_the_verdict_is_that_of_the_turned_scene(angle):
-    """All of a scene turned: the shares are the same, to 1e-5 of themselves, as is the budget.
+def test_estimates_are_invariant_under_rotation(angle):
+    """Small-displacement error and error budget of a rotated scene are the same, to 1e-5.
 
-    By the largest component the share in the force would be smaller by up to the root of 2.
+    The largest component instead of the norm would give a force error smaller by up to √2.
     """
     found = []
     for turn in (0.0, np.deg2rad(angle)):
@@ -200,7 +200,7 @@ def test_the_verdict_is_that_of_the_turned_scene(angle):
 
 
 def tilted(angle, how):
-    """A block held by its top, into which a floor is tilted by a given displacement."""
+    """Return error and force of a block fixed at its top and a floor tilted by a displacement."""
     scene = block("quadrilateral", n=8)
     x = ufl.SpatialCoordinate(scene.mesh)
     floor = fc.HalfSpace((0.5, 0.02), (-np.sin(angle), np.cos(angle)))
@@ -229,10 +229,10 @@ def tilted(angle, how):
 
 @pytest.mark.each
 @pytest.mark.parametrize("how", ["expression", "function", "function on Γc", "profile"])
-def test_a_plane_tilted_by_its_displacement_is_no_plane(how):
-    """The estimate is the difference to the tilted plane itself; none if shifted.
+def test_error_of_a_plane_tilted_by_its_displacement(how):
+    """The estimate is the relative difference e to the tilted plane; zero if only shifted.
 
-    To a tenth, or once to twice the share squared: it leaves out what is of the second order.
+    It agrees within the larger of e/10 and e², at most 2 e²: second-order terms are neglected.
     """
     for angle in (0.03, 0.1):
         told, force = tilted(angle, how)
@@ -246,7 +246,7 @@ def test_a_plane_tilted_by_its_displacement_is_no_plane(how):
     assert told.worst <= 1e-3
 
 
-def test_small_motion_is_no_matter():
+def test_small_displacement_gives_no_warning():
     problem, _ = pressed(body=-1e-4)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -254,8 +254,8 @@ def test_small_motion_is_no_matter():
     assert step.verdict.small_displacement_error["contact"].worst < 0.01
 
 
-def test_an_obstacle_that_tells_no_distance():
-    """A gap given as a number of its own is not looked at elsewhere; its normal is."""
+def test_prescribed_gap_has_no_small_displacement_error():
+    """A prescribed gap, unlike its normal, is not evaluated at X + u: the gap there is infinite."""
     scene = block("quadrilateral", n=4, up=-10.0)
     obstacle = fc.PrescribedGap(0.0, (0.0, -1.0))
     problem, contact = scene.problem(
@@ -266,8 +266,8 @@ def test_an_obstacle_that_tells_no_distance():
     assert np.all(np.isinf(gap))
 
 
-def test_the_error_budget_has_it():
-    """Its line for the normal force is the difference to the obstacle dragged, within a third."""
+def test_error_budget_includes_the_small_displacement_error():
+    """The kinematics part of the normal force is the difference to the dragged obstacle, to 1/3."""
 
     def solved(**scene):
         problem, contact = pressed(**scene)
@@ -288,11 +288,11 @@ def test_the_error_budget_has_it():
 @pytest.mark.parametrize(
     ("cell", "transverse"), [("triangle", None), ("tetrahedron", None), ("tetrahedron", 0.1)]
 )
-def test_friction_that_turns_with_slip_is_part_of_the_estimate(transverse, cell, enforcement):
-    """Its stiffness along Γc at slipping points, which alone may hold a body in space.
+def test_estimate_includes_tangential_stiffness_of_slip(transverse, cell, enforcement):
+    """Friction that turns with the slip direction has a tangential stiffness at slipping points.
 
-    Reference: the derivative of the law's traction by UFL, to 1e-9 of the stiffness; in the plane
-    there is none of it.
+    It may be all that constrains a body in 3D, and is zero in 2D. Reference: the derivative of the
+    law's traction by UFL, to 1e-9 of the stiffness k_t.
     """
     d = 2 if cell == "triangle" else 3
     scene = block(cell, n=3, E=1e3)

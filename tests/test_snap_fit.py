@@ -1,4 +1,4 @@
-"""A rigid tool that a force drives against a soft slope, as in a snap fit."""
+"""A rigid tool pushed by a force against a soft slope, as in a snap fit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ RADIUS, SLOPE, WAY = 2.0, 0.5, 0.5
 
 
 def pushed(by, loads, *, friction):
-    """A disc is pushed along x up a rising cantilever; force, place and iterations, (3, n)."""
+    """Push a disc along x up a rising cantilever; return force, position, iterations, (3, n)."""
 
     def rising(x):
         return np.column_stack([x[:, 0], x[:, 1] + SLOPE * x[:, 0]])
@@ -42,11 +42,12 @@ def pushed(by, loads, *, friction):
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.2])
-def test_by_force_as_by_displacement(friction):
-    """As far as the tool has to be led for a force, so far the force drives it: to 1e-6.
+def test_force_and_displacement_control_agree(friction):
+    """The force due to a prescribed displacement causes this displacement, to 1e-6.
 
-    The tool bears on one or two points. An iterate that loses them closed the gap by what a closed
-    point would yield, a thousandth of it: "no progress", in increments however small.
+    The tool has one or two closed points. An iterate without any once closed the gap by the
+    deformation due to a closed point, a thousandth of it: "no progress", however small the
+    increments.
     """
     ways = np.linspace(0.1, 1.0, 10) * WAY
     forces, _, _ = pushed("displacement", ways, friction=friction)
@@ -58,10 +59,10 @@ def test_by_force_as_by_displacement(friction):
 
 
 def step_of(gap, force, parked=(), *, along=None):
-    """How far the first Newton step moves a tool above an arm, driven by a force along y (length).
+    """Return the first Newton displacement of a tool above an arm, by a force along y (length).
 
-    ``parked``: gap of a wall beside the arm, which the tool does not move. ``along``: a force along
-    x on the tool, which is led there otherwise.
+    ``parked``: gap of a wall next to the arm, which the tool does not move. ``along``: a force
+    along x on the tool; by default its displacement along x is prescribed.
     """
     scene = Beside({"arm": Box(size=(1.0, 1.0), n=(4, 4))}, E=1e3)
     scene.hold("arm", LEFT, 0)
@@ -90,29 +91,29 @@ def step_of(gap, force, parked=(), *, along=None):
 
 @pytest.mark.parametrize("gap", [1e-2, 1e-6])
 @pytest.mark.parametrize("parked", [(), (1e-7,)], ids=["alone", "beside a nearer one"])
-def test_a_step_goes_through_twice_the_gap(gap, parked):
-    """A tool above the arm, pressed down: its step is twice its gap, whatever else is how near.
+def test_newton_step_is_twice_the_gap(gap, parked):
+    """A tool above the arm, pressed down, moves by twice its gap, whatever other gaps there are.
 
-    To 1e-3, for the arm yields by force/E, and a closed point bears the force; and to the gap by
-    the size of the mesh, within twice of which any step ends.
+    Tolerance 1e-3, as the arm deforms by force/E and a closed point carries the force, plus the gap
+    by the size of the mesh, as any step is at most twice that size.
     """
     moved = step_of(gap, -1e-7, parked)
     assert moved == pytest.approx(-2 * gap, rel=1e-3 + gap)
 
 
-def test_a_step_by_the_smaller_of_two_forces():
-    """A tool that a larger force pushes along the surface closes its gap all the same."""
+def test_newton_step_with_a_larger_tangential_force():
+    """A tool with a larger force along the surface nevertheless closes its gap."""
     moved = step_of(1e-6, -1e-7, along=2e-7)
     assert moved == pytest.approx(-2e-6, rel=1e-3)
 
 
 @pytest.mark.parametrize("parked", [(), (1e-7,)], ids=["alone", "beside a nearer one"])
-def test_a_step_away_from_what_is_near(parked):
-    """A tool driven away from an arm meets nothing, and goes twice the size of the mesh, √2."""
+def test_newton_step_away_from_the_surface(parked):
+    """A tool pushed away from an arm meets nothing, and moves by twice the mesh size, √2."""
     assert step_of(1e-6, 1e-7, parked) == pytest.approx(2 * np.sqrt(2), rel=1e-3)
 
 
-def test_a_force_beyond_what_the_arm_bears():
-    """The error says to prescribe the displacement instead."""
+def test_force_above_the_limit_of_the_arm():
+    """The error suggests prescribing the displacement instead."""
     with pytest.raises(fc.NotConverged, match="displacement of the obstacle instead of the force"):
         pushed("force", [1.0], friction=0.2)

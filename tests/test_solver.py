@@ -46,10 +46,10 @@ TIGHT = {"snes_rtol": 1e-13}
 
 @pytest.mark.parametrize(("cell", "degree"), GRID)
 def test_patch(cell, degree):
-    """Uniform compression on a shuffled mesh: stress uniform, penetration p/k_n everywhere.
+    """Uniform compression on a shuffled mesh gives uniform stress and the penetration p/k_n.
 
     Reference: Hooke's law in plane strain or space, u_n = p/k_n exactly (references, 6). Tolerance
-    1e-10 of the fields: round-off of the solve, the solver's own being 1e-13 of the forces.
+    1e-10 of the fields: round-off; the solver's tolerance is 1e-13 of the forces.
     """
     p, k_n = 2.0, 5e3
     scene = block(cell, degree, up=-p, shuffled=True)
@@ -78,13 +78,13 @@ def test_patch(cell, degree):
 
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
 @pytest.mark.parametrize("condensation", [None, False])
-def test_a_block_far_above_its_floor(cell, condensation):
-    """Pressed and pulled with nothing to hold it, it is set down and solved as one that touches.
+def test_block_far_above_its_floor_is_positioned(cell, condensation):
+    """An unconstrained block above its floor is positioned and solved as if without a gap.
 
-    Friction counts its way along the floor from where it was: no way by which it came may be in
-    the start, nor a tilt. Reference: the same without a gap, by the friction summed up, to 1e-6:
-    residuals are some 1e-9 of the forces and more, by the round-off of the way. They took 21
-    iterations at most; where the load led the way up to 293, or found nothing.
+    Slip is measured from the rest position, so that positioning must add no tangential motion and
+    no tilt. Reference: the tangential force without a gap, to 1e-6: residuals are 1e-9 of the
+    forces and more, by round-off of the displacement. At most 21 iterations were needed, up to 293
+    or no solution with positioning along the load.
     """
     found = []
     for gap in (0.0, 0.05, 0.5):
@@ -99,11 +99,11 @@ def test_a_block_far_above_its_floor(cell, condensation):
 
 
 @pytest.mark.parametrize("gaps", [(0.0, 0.05), (1e-4, 1e-5), (0.1, 0.05)])
-def test_a_block_above_another_that_is_free(gaps):
-    """Both are set down, each on what is below it, so that no point that bears is left open.
+def test_stack_of_unconstrained_blocks_is_positioned(gaps):
+    """Two unconstrained blocks are positioned on each other so that no loaded point is open.
 
-    Reference: the same without gaps, by the friction summed up, to 1e-6, as above. They took 2
-    iterations; where round-off said which points are closed up to 301.
+    Reference: the tangential forces without gaps, to 1e-6. 2 iterations were needed, up to 301
+    where round-off decided which points are closed.
     """
     found = []
     for low, high in ((0.0, 0.0), gaps):
@@ -119,11 +119,11 @@ def test_a_block_above_another_that_is_free(gaps):
 
 
 @pytest.mark.parametrize("tilt", [-0.1, 0.003])
-def test_a_block_above_a_floor_that_is_tilted(tilt):
-    """Set down on all of its bottom, which goes a little along the floor as it turns.
+def test_block_above_tilted_floor_is_positioned(tilt):
+    """A block above a tilted floor is positioned on its whole bottom, by a rotation with some slip.
 
-    Reference: the load (0.02, -1), to the solver's 1e-9. They took 63 and 52 iterations; on an edge
-    that of -0.1 found nothing, the other took 275.
+    Reference: the load (0.02, -1), to 1e-8; the solver's tolerance is 1e-9. 63 and 52 iterations
+    were needed; positioned on an edge, the tilt of -0.1 had no solution, the other took 275.
     """
     scene = block("triangle", 1, side=0.02, up=-1.0, n=4)
     normal = np.array([-np.sin(tilt), np.cos(tilt)])
@@ -134,11 +134,12 @@ def test_a_block_above_a_floor_that_is_tilted(tilt):
     assert close(contact.resultants().force, [-0.02, 1.0], 1e-8)
 
 
-def test_a_block_that_is_led_into_a_corner():
-    """Floor and wall grip, and nothing but a turn about the corner goes along neither: no way.
+def test_block_is_positioned_in_corner_of_floor_and_wall():
+    """A block in front of a floor and a wall with friction is moved into their corner by its load.
 
-    By its load it is next to both: 12 iterations, by other releases 27; turned it took 157.
-    Reference: the forces of both, which carry the load (-0.6, -1), to the solver's 1e-9.
+    12 iterations were needed (27 with other releases); 157 if the block was rotated into the
+    corner, the only motion without slip. Reference: both contact forces balance the load
+    (-0.6, -1), to 1e-8; the solver's tolerance is 1e-9.
     """
     scene = block("triangle", 1, side=-0.6, up=-1.0, n=4)
     law, gap = fc.Coulomb(friction=0.2), 0.01
@@ -160,10 +161,10 @@ def test_a_block_that_is_led_into_a_corner():
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_forces_balance_on_the_whole_path(method):
-    """Contact force = minus the reaction of the held top, from the bulk form alone; cone, status.
+    """The contact force is minus the reaction of the top, and inside of the friction cone.
 
-    Reference: the sum of the bulk residual over the top's dofs. Tolerance 1e-7 of the force: a
-    hundred times the solver's, which bounds the norm and not the sum.
+    Open, stick and slip points all occur. Reference: the bulk residual, summed over the dofs of
+    the top. Tolerance 1e-7 of the force, as the solver's 1e-9 bounds the norm, not the sum.
     """
     made = Rub(method=method)
     space = made.scene.u.function_space
@@ -193,11 +194,11 @@ def test_forces_balance_on_the_whole_path(method):
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_failed_increment_leaves_no_trace(method):
-    """An increment stopped after one iteration raises, and u and history are as before to the bit.
+    """An increment stopped after one iteration raises, and u and history are bitwise unchanged.
 
-    Then it goes on from there: the problem that failed is solved at once under the conditions of
-    the last commit; and another on the same u and contact makes the increment, with the result of
-    one that never failed. 1e-12: the very same computation, but for sums over ranks.
+    Afterwards the failed problem is solved without iterations under the loads of the last commit,
+    and another problem with the same u and contact solves the increment as one that never failed,
+    to 1e-12: the computation is the same except for sums over ranks.
     """
     made, twin = Rub(method=method), Rub(method=method)
     scene, contact = made.scene, made.contact
@@ -215,7 +216,7 @@ def test_failed_increment_leaves_no_trace(method):
     )
     before = snapshot(made)
     made.move(*PATH[2])
-    for _ in range(2):  # and a second time, from a solver that has failed
+    for _ in range(2):  # the second time with a solver that has failed
         with pytest.raises(fc.NotConverged) as caught:
             limited.solve()
         error = caught.value
@@ -237,7 +238,7 @@ def test_failed_increment_leaves_no_trace(method):
 
 
 def test_increments_restores_the_load():
-    """`increments` that fails: load, u and history are those of the last committed increment."""
+    """A failing `increments` restores load, u and history of the last committed increment."""
     made = Rub(method="newton")
     steps = fc.increments(made.problem, made.push[1], 0.0, -0.03, steps=3)
     done = []
@@ -255,8 +256,8 @@ def test_increments_restores_the_load():
     assert made.problem.increment == 2
 
 
-def test_increments_lead_the_load():
-    """Loads in equal steps up to the end, each solved and committed, numbered from 1."""
+def test_increments_apply_the_load_in_equal_steps():
+    """`increments` applies equal load steps, each solved and committed, numbered from 1."""
     made = Rub(fc.Frictionless(k_n=2e4))
     steps = list(fc.increments(made.problem, made.push[1], 0.0, -0.02, steps=4))
     assert [s.load for s in steps] == pytest.approx([-0.005, -0.01, -0.015, -0.02], rel=1e-14)
@@ -268,7 +269,7 @@ def test_increments_lead_the_load():
 
 @pytest.mark.parametrize("lift", [0.0, 1e-3])
 def test_summary_without_forces(lift):
-    """Before anything touches there is no force that the residual could be relative to."""
+    """Before first touch the summary reports that there are no forces and no contact force."""
     scene = block("quadrilateral")
     problem, _ = scene.problem(
         fc.Coulomb(0.3, 1e4, 1e4),
@@ -283,8 +284,8 @@ def test_summary_without_forces(lift):
     assert "solved by the predictor" in problem.solve().summary()
 
 
-def test_why_all_unknowns_is_said_once(caplog):
-    """`increments` asks again whether to condense; the log has no news to tell."""
+def test_reason_against_static_condensation_is_logged_once(caplog):
+    """`increments` decides on static condensation again, but the reason is logged once."""
     with caplog.at_level("INFO", logger="fenics_contact"):
         made = Rub(condensation=False)
         list(fc.increments(made.problem, made.push[1], 0.0, -0.01, steps=2))
@@ -296,18 +297,18 @@ def test_why_all_unknowns_is_said_once(caplog):
 
 
 def recorded(made: Rub) -> list[float]:
-    """Norms of the residual as SNES goes, from now on."""
+    """Return a list to which SNES appends the residual norm of every iteration."""
     norms: list[float] = []
     made.problem.snes.setMonitor(lambda snes, it, norm: norms.append(norm))
     return norms
 
 
-def test_pairs_do_not_outlive_an_increment():
-    """The same increment from the same state takes the same iterations, whatever was solved before.
+def test_lbfgs_pairs_are_discarded_after_each_increment():
+    """The iterations of an increment do not depend on the increments solved before.
 
-    Frictionless, so that there is no history, and short enough that H₀ is never made anew: the
-    second run differs from the first by the pairs of L-BFGS alone, if any were kept. Residual norms
-    of every iteration agree to 1e-9: round-off of a sum over ranks, grown over some iterations.
+    Without friction there is no history, and H₀ is not factorised again: retained L-BFGS pairs
+    would be the only difference. Residual norms of every iteration agree to 1e-9 of the first,
+    round-off of sums over ranks that has grown over some iterations.
     """
     made = Rub(fc.Frictionless(k_n=1e3), method="lbfgs")
     runs = []
@@ -317,7 +318,7 @@ def test_pairs_do_not_outlive_an_increment():
         norms = recorded(made)
         step = made.problem.solve()
         made.problem.snes.cancelMonitor()
-        assert step.factorisations == (number == 0)  # else H₀ differs too
+        assert step.factorisations == (number == 0)  # otherwise H₀ would differ too
         runs.append((step.iterations, np.array(norms), gathered(COMM, owned(made.scene.u))))
     first, _, again = runs
     assert first[0] == again[0] > 3
@@ -326,8 +327,8 @@ def test_pairs_do_not_outlive_an_increment():
     assert close(again[2], first[2], 1e-12)
 
 
-def test_factorisation_is_kept():
-    """Increments that need no refresh of H₀ use the factorisation there is; a new E does not."""
+def test_factorisation_is_reused_until_the_modulus_changes():
+    """Increments reuse the factorisation of H₀; a change of E requires another."""
     made = Rub(fc.Frictionless(k_n=1e3))
     made.move(0.0, 0.05)
     assert made.problem.solve().factorisations == 1
@@ -339,7 +340,7 @@ def test_factorisation_is_kept():
     made.scene.E.value *= 2
     stiffer = made.problem.solve()
     assert stiffer.factorisations >= 1
-    # The change got through: a stiffer body is pushed harder against the same cushion.
+    # The change takes effect: the contact force of a stiffer body is larger.
     made.problem.commit()
     made.scene.E.value /= 2
     softer = made.problem.solve()
@@ -347,7 +348,7 @@ def test_factorisation_is_kept():
 
 
 def test_modulus_changed_between_increments():
-    """The patch after a change of E: u of the new modulus, 1e-10 as in `test_patch`."""
+    """After a change of E, u is the exact solution of the new modulus, to 1e-10."""
     scene = block("quadrilateral", up=-2.0, nu=0.0)
     problem, _ = scene.problem(fc.Frictionless(k_n=5e3), scene.rollers(), petsc_options=TIGHT)
     for E in (1000.0, 250.0):
@@ -360,9 +361,9 @@ def test_modulus_changed_between_increments():
 
 
 def test_solving_twice_changes_nothing():
-    """A converged increment solved again takes no iteration and leaves u as it is.
+    """A converged increment that is solved again takes no iteration and does not change u.
 
-    Without commit the history is the same, so the state is a solution already.
+    Without a commit the history is the same, so that the state is already a solution.
     """
     made = Rub()
     walk(made, path=PATH[:2])
@@ -371,15 +372,15 @@ def test_solving_twice_changes_nothing():
     before = gathered(COMM, owned(made.scene.u))
     step = made.problem.solve()
     assert step.iterations == 0
-    # Through the dimensionless solution and back: round-off.
+    # Round-off of the conversion to dimensionless u and back.
     assert close(gathered(COMM, owned(made.scene.u)), before, 1e-14)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
-def test_a_held_load(method):
-    """Increments in which nothing changes take no iteration and add no slip, at every stage.
+def test_constant_load_takes_no_iterations_and_adds_no_slip(method):
+    """Increments without a change of load take no iteration and add no slip, along the whole path.
 
-    Round-off only: 1e-12 of the accumulated slip, which is of size 0.01.
+    Tolerance 1e-12 of the accumulated slip, about 0.01: round-off.
     """
     made = Rub(method=method)
     for move in PATH:
@@ -396,9 +397,9 @@ def test_a_held_load(method):
 
 @pytest.mark.parametrize(("cell", "degree"), [("quadrilateral", 1), ("triangle", 2)])
 def test_methods_agree(cell, degree):
-    """L-BFGS and Newton end every increment of the path in the same state.
+    """L-BFGS and Newton reach the same state at the end of the path.
 
-    1e-7 of the largest value: both are solved to 1e-9 of the forces, and the path adds up.
+    Tolerance 1e-7 of the largest value: 1e-9 of the forces per increment, accumulated.
     """
     fields = []
     for method in ("lbfgs", "newton"):
@@ -414,11 +415,11 @@ def test_methods_agree(cell, degree):
 
 @pytest.mark.parametrize("law", ["coulomb", "frictionless"])
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
-def test_units_do_not_matter(method, law):
-    """The same scene in N-mm, in SI and by factors of 1e-9: same effort, same digits.
+def test_solution_is_independent_of_units(method, law):
+    """Effort and solution are the same in N-mm, in SI and with units scaled by 1e-9 or 1e9.
 
-    Stiffnesses by `RelativeStiffness`, so that the measured E/h is in it too. Tolerance 1e-9 of
-    the fields: the same way, with the round-off of other numbers.
+    The stiffnesses are the default, relative to the computed E/h. Tolerance 1e-9 of the fields:
+    the same iterations, with different round-off.
     """
     make = {"coulomb": fc.Coulomb(0.3), "frictionless": fc.Frictionless()}[law]
     path = PATH[:4] if law == "coulomb" else PATH[:1]
@@ -442,16 +443,16 @@ def test_units_do_not_matter(method, law):
 MESHES = {
     "triangle": {},
     "hexahedron": {"n": 2},
-    # Γc on the first rank alone.
+    # Γc on the first rank only.
     "quadrilateral": {"n": (1, 6), "partitioner": layers("quadrilateral")},
 }
 
 
 @pytest.mark.parametrize("cell", MESHES)
-def test_any_number_of_ranks(cell):
-    """Resultants of the path on all ranks and on one alone, solved by each rank for itself.
+def test_resultants_do_not_depend_on_the_number_of_ranks(cell):
+    """Resultants on all ranks agree with those that each rank computes alone.
 
-    1e-8 of the largest force: ten times the solver's tolerance.
+    Tolerance 1e-8 of the normal force, ten times the solver's.
     """
     resultants = []
     for comm in (COMM, MPI.COMM_SELF):
@@ -471,7 +472,7 @@ def test_any_number_of_ranks(cell):
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_ranks_without_cells(method):
-    """One single cell: all ranks but one have nothing at all. Its load arrives; 1e-8, as above."""
+    """A mesh of one cell, on one rank: the contact force equals the load, to 1e-8."""
     scene = block("quadrilateral", n=1, up=-1.0)
     assert COMM.allreduce(scene.mesh.topology.index_map(2).size_local) == 1
     problem, contact = scene.problem(fc.Coulomb(0.3), scene.rollers(), method=method)
@@ -485,12 +486,12 @@ def test_ranks_without_cells(method):
 
 @pytest.mark.parametrize("condensation", [False, None])
 @pytest.mark.parametrize("method", ["lbfgs", "continuation", "alternating"])
-def test_methods_without_a_tangent_continue_the_last_increment(method, condensation):
-    """A block that sticks is pressed and relieved by uneven increments: u follows the load.
+def test_methods_without_tangent_extrapolate_the_last_increment(method, condensation):
+    """A sticking block is loaded and unloaded in unequal increments, without more iterations.
 
-    Reference: the equations are linear, so that after the first increment the start is the
-    solution, whatever the sizes of the increments, and 0 iterations follow; at the end u is 0.4 of
-    that of the first increment, to 1e-8 (the solver's own tolerance is 1e-9 of the forces).
+    Reference: the equations are linear, so that after the first increment the predictor is the
+    solution for any increment size, and 0 iterations are needed; at the end u is 0.4 of that of
+    the first increment, to 1e-8 (the solver's tolerance is 1e-9 of the forces).
     """
     scene = block("quadrilateral", n=4)
     led = fem.Constant(scene.mesh, 0.0)
@@ -509,19 +510,19 @@ def test_methods_without_a_tangent_continue_the_last_increment(method, condensat
     assert close(nodal(scene.u), 0.4 * first, 1e-8)
 
 
-# ---- what is said, kept and freed ----------------------------------------------------------------
+# ---- messages, restored state and memory ---------------------------------------------------------
 
 
-def test_silence(caplog):
-    """A sound solve logs no warning and prints nothing that the caller did not ask for."""
+def test_sound_solve_logs_no_warning(caplog):
+    """A successful solve logs no warning."""
     with caplog.at_level(logging.WARNING, logger="fenics_contact"):
         made = Rub(fc.Frictionless(k_n=2e4))
         walk(made, path=PATH[:1])
     assert not [r for r in caplog.records if r.name.startswith("fenics_contact")]
 
 
-def test_a_problem_is_freed_without_the_garbage_collector() -> None:
-    """No cycle of references: ranks free their factorisations together, where the name goes."""
+def test_problem_is_freed_without_garbage_collector() -> None:
+    """A problem has no reference cycles: all ranks free its factorisations at the same `del`."""
     made = Rub()
     made.move(*PATH[1])
     made.problem.solve()
@@ -536,8 +537,8 @@ def test_a_problem_is_freed_without_the_garbage_collector() -> None:
             gc.enable()
 
 
-def test_restore_drops_what_was_not_committed() -> None:
-    """A solved increment that is not committed leaves nothing: u and history of the last commit."""
+def test_restore_discards_the_uncommitted_increment() -> None:
+    """`restore` resets u and history, after an uncommitted increment, to the last commit."""
     made = Rub()
     made.move(*PATH[1])
     made.problem.solve()
@@ -554,8 +555,8 @@ def test_restore_drops_what_was_not_committed() -> None:
 
 
 @pytest.mark.parametrize("condensation", [None, False])
-def test_newton_after_an_increment_of_no_iterations(condensation):
-    """A first increment without load needs no tangent, and leaves none to start the next from."""
+def test_newton_after_increment_without_iterations(condensation):
+    """An increment without load computes no tangent, and the next one starts without it."""
     made = Rub(method="newton", condensation=condensation)
     made.move(0.0, 0.0)
     made.scene.u.x.array[:] = 0.0
@@ -566,11 +567,11 @@ def test_newton_after_an_increment_of_no_iterations(condensation):
 
 
 @pytest.mark.parametrize("condensation", [None, False])
-def test_newton_starts_where_the_right_points_slip(condensation):
-    """Small increments along a path take fewer steps than from the committed state.
+def test_newton_predictor_reduces_iterations_on_slip_path(condensation):
+    """Small increments with the predictor take less than 80 % of the iterations without it.
 
-    They start on the last tangent, or where the last change leads. And lead to the same state: both
-    solve to 1e-9 of the forces, 1e-7 over the path.
+    The predictor is the last tangent or the last change of u. The states agree to 1e-7, as each
+    increment is solved to 1e-9 of the forces.
     """
     taken, states = [], []
     for helped in (True, False):

@@ -1,4 +1,4 @@
-"""Options of PETSc, by arguments and by the database; a solver or a method of one's own."""
+"""PETSc options by arguments and by the database; user-written solvers and methods."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ COMM = MPI.COMM_WORLD
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_options_reach_the_solver(method):
-    """A number of iterations given as an option is the limit; the database is clean afterwards."""
+    """Options set the tolerance and the iteration limit, and do not remain in the database."""
     database = PETSc.Options()
     before = database.getAll()
     made = Rub(method=method, petsc_options={"snes_max_it": 1, "snes_rtol": 1e-5})
@@ -39,8 +39,8 @@ def test_options_reach_the_solver(method):
     assert caught.value.iterations == 1
 
 
-def test_options_database_wins():
-    """What stands in the database under the prefix wins over the arguments, and stays there."""
+def test_options_database_overrides_arguments():
+    """Options in the database under the prefix override the arguments, and remain there."""
     database = PETSc.Options()
     key = "mine_snes_max_it"
     database.setValue(key, 1)
@@ -57,7 +57,7 @@ def test_options_database_wins():
 
 
 def test_options_database_changes_the_method():
-    """``<prefix>snes_type`` and the type of the linear solver are the caller's if he wants."""
+    """``<prefix>snes_type`` and the linear solver can be chosen in the options database."""
     database = PETSc.Options()
     given = {"other_snes_type": "newtonls", "other_tangent_pc_factor_mat_solver_type": "petsc"}
     if COMM.size > 1:  # PETSc's own factorisation is serial
@@ -76,8 +76,8 @@ def test_options_database_changes_the_method():
         assert made.problem.snes.getKSP().getPC().getFactorSolverType() == "petsc"
 
 
-def test_two_prefixes_do_not_disturb_one_another():
-    """Two problems with options of their own, made one after the other and used in turn."""
+def test_two_prefixes_are_independent():
+    """Two problems with different prefixes each use their own options."""
     database = PETSc.Options()
     before = database.getAll()
     short = Rub(prefix="short_", petsc_options={"snes_max_it": 3})
@@ -93,14 +93,14 @@ def test_two_prefixes_do_not_disturb_one_another():
     assert long.problem.snes.getOptionsPrefix() == "long_"
 
 
-# ---- a solver of one's own -----------------------------------------------------------------------
+# ---- user-written solvers ------------------------------------------------------------------------
 
 
 class OwnNewton:
-    """What a user writes with DOLFINx and petsc4py alone: F + contact.form(v), SNES newtonls."""
+    """A solver with DOLFINx and petsc4py only: F + contact.form(v), SNES newtonls."""
 
     def __init__(self, F, contact, u, bcs) -> None:
-        """Compile the sum of bulk and contact."""
+        """Compile the sum of bulk and contact forms, and create the SNES."""
         v = ufl.TestFunction(u.function_space)
         du = ufl.TrialFunction(u.function_space)
         total = F + contact.form(v)
@@ -124,12 +124,12 @@ class OwnNewton:
         self.snes.getKSP().getPC().setFactorSolverType("mumps")
 
     def set_u(self, x) -> None:
-        """Ghosts included."""
+        """Copy x to u, and update its ghosts."""
         x.copy(self.u.x.petsc_vec)
         self.u.x.scatter_forward()
 
     def residual(self, snes, x, b) -> None:
-        """With Dirichlet conditions, as in DOLFINx's demos."""
+        """Assemble the residual with Dirichlet conditions, as in DOLFINx's demos."""
         self.set_u(x)
         with b.localForm() as local:
             local.set(0.0)
@@ -139,14 +139,14 @@ class OwnNewton:
         fem.petsc.set_bc(b, self.bcs, self.u.x.petsc_vec, alpha=-1.0)
 
     def jacobian(self, snes, x, J, P) -> None:
-        """Likewise."""
+        """Assemble the Jacobian with Dirichlet conditions."""
         self.set_u(x)
         P.zeroEntries()
         fem.petsc.assemble_matrix(P, self.J, bcs=self.bcs)
         P.assemble()
 
     def solve(self) -> None:
-        """From the present u."""
+        """Solve with the present u as initial guess."""
         self.u.x.petsc_vec.copy(self.x)
         self.snes.solve(None, self.x)
         assert self.snes.getConvergedReason() > 0
@@ -154,10 +154,11 @@ class OwnNewton:
 
 
 @pytest.mark.parametrize(("cell", "degree"), [("quadrilateral", 1), ("triangle", 2)])
-def test_a_solver_of_ones_own(cell, degree):
-    """`contact.form` in a plain SNES, commits by hand: the same u and slip as `ContactProblem`.
+def test_user_written_newton_solver_agrees(cell, degree):
+    """`contact.form` in a plain SNES with explicit commits agrees with `ContactProblem`.
 
-    1e-8 of the largest value over the whole path: ContactProblem to 1e-11 of the forces.
+    Tolerances over the whole path, relative to the largest value: 1e-8 for u, 1e-7 for tractions
+    and slip. `ContactProblem` is solved to 1e-11 of the forces.
     """
     made = Rub(cell=cell, degree=degree, petsc_options={"snes_rtol": 1e-11})
     mine = Rub(cell=cell, degree=degree)
@@ -184,10 +185,10 @@ def test_a_solver_of_ones_own(cell, degree):
 @pytest.mark.whole
 @pytest.mark.parametrize("condensation", [None, False])
 @pytest.mark.parametrize("kind", ["newtontr", "newtontrdc", "ngmres", "anderson", "ncg"])
-def test_types_of_snes_that_work(kind, condensation):
-    """Three increments, begun where the last one ended: the state of the package's own choice.
+def test_supported_snes_types_agree(kind, condensation):
+    """Other types of SNES reach the state of the default type after three increments.
 
-    Both to 1e-9 of the forces: states agree to 1e-6.
+    Both are solved to 1e-9 of the forces; the states agree to 1e-6.
     """
     made, usual = (
         Rub(method="newton", condensation=condensation, petsc_options=options)
@@ -201,32 +202,32 @@ def test_types_of_snes_that_work(kind, condensation):
 
 @pytest.mark.whole
 @pytest.mark.parametrize("kind", ["vinewtonrsls", "fas", "newton", "ksponly"])
-def test_types_of_snes_that_cannot_work(kind):
-    """Some want bounds or a hierarchy, and without them end the program: refused by name."""
+def test_unsupported_snes_types_are_refused(kind):
+    """Types of SNES that require bounds or a hierarchy, or that do not exist, are refused."""
     raised_everywhere(
         lambda: Rub(petsc_options={"snes_type": kind}), ValueError, "snes_type", kind, "newtonls"
     )
 
 
 class Plain(StandaloneMethod):
-    """Newton's method without a line search: all that a new method has to say."""
+    """Newton's method without a line search, as a minimal user-defined method."""
 
     def __init__(self, context: SolverContext) -> None:
-        """One SNES."""
+        """Create one SNES."""
         options = {"snes_linesearch_type": "basic", "snes_max_it": 50}
         self._newton = context.newton("plain_", options)
 
     def solve(self) -> tuple[int, int]:
-        """See `Method.solve`."""
+        """Solve with the consistent tangent; return what the SNES returns (`Method.solve`)."""
         self._newton.attach(consistent=True)
         return self._newton.solve()
 
 
 @pytest.mark.parametrize("condensation", [True, False])
-def test_a_method_of_ones_own(monkeypatch, condensation):
-    """A class and its name are enough: the state is that of the package's Newton's method.
+def test_user_defined_method_agrees(monkeypatch, condensation):
+    """A class registered by name in `METHODS` reaches the state of the package's Newton's method.
 
-    Both satisfy the law to 1e-9 of the forces: states agree to 1e-6.
+    Both are solved to 1e-9 of the forces; the states agree to 1e-6.
     """
     monkeypatch.setitem(METHODS, "plain", Plain)
     law, states = fc.Coulomb(0.3, k_n=2e3, k_t=1e3), []

@@ -1,4 +1,4 @@
-"""Laws, shares of H₀, rules on Γc, several contacts and none: solved as statics has it."""
+"""Laws, H₀, quadrature on Γc, several contacts and none, against references from statics."""
 
 import numpy as np
 import pytest
@@ -13,17 +13,17 @@ from scenes.rubbing import PATH, Rub, walk
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
 
-# Solver tolerances for comparisons finer than the default of 1e-9 of the forces.
+# Solver tolerance for comparisons below the default of 1e-9 of the forces.
 TIGHT = {"snes_rtol": 1e-13}
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_two_contacts_and_no_condition(cell, method):
-    """A block in a corner, pressed from two sides and held by nothing else: uniform stress.
+def test_two_contacts_without_dirichlet_conditions_along_the_load(cell, method):
+    """A block in a corner, pressed from two sides, has uniform stress.
 
-    Reference: each wall carries the load opposite to it, 2 and 1; penetrations by p/k_n. In space
-    friction on the floor is what holds the third direction. Tolerances: 1e-10, as in `test_patch`.
+    Reference: floor and wall carry the opposite loads, 2 and 1, with penetrations p/k_n. In 3D a
+    Dirichlet condition constrains the third direction. Tolerance 1e-10, as in `test_patch`.
     """
     scene = block(cell, up=-2.0, nu=0.0)
     scene.pull(RIGHT, scene.vector(side=-1.0))
@@ -48,7 +48,7 @@ def test_two_contacts_and_no_condition(cell, method):
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_all_points_stick(method):
-    """A scene that sticks everywhere, with a traction in its history, is a solution like others."""
+    """Solutions in which all points stick, with traction histories, are in equilibrium to 1e-8."""
     scene = block("quadrilateral", up=-1.0)
     problem, _ = scene.problem(fc.Coulomb(5.0, k_n=1e4, k_t=1e3), [], method=method)
     for side in (0.0, 0.1, 0.2, 0.15, 0.0):
@@ -57,17 +57,17 @@ def test_all_points_stick(method):
         problem.commit()
         r = step.contacts["contact"]
         assert r.slip == 0 and r.stick > 0
-        # Equilibrium; ten times the solver's tolerance.
+        # Equilibrium, to ten times the tolerance of the solver.
         assert close(r.force, -scene.vector(side=side, up=-1.0), 1e-8)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_prescribed_normal_traction(cell, method):
-    """Duvaut-Lions: the traction on Γc is -p n and friction up to μ p, whatever the gap.
+    """Duvaut-Lions: Γc has the normal traction -p n and friction up to μ p, whatever the gap.
 
-    The top is held and moved aside far beyond sliding; ν = 0, so that nothing rubs before that.
-    Reference: N = p, T = μ p exactly, uniform. Tolerance 1e-8, ten times the solver's.
+    The top is moved sideways far beyond the onset of slip; ν = 0, so that nothing slips before.
+    Reference: N = p, T = μ p, uniform. Tolerance 1e-8, ten times that of the solver.
     """
     scene = block(cell, nu=0.0)
     aside = fem.Constant(scene.mesh, 0.0)
@@ -83,7 +83,7 @@ def test_prescribed_normal_traction(cell, method):
         problem.commit()
         assert r.normal_force == pytest.approx(4.0, rel=1e-8)
         assert r.tangential_force == pytest.approx(0.3 * 4.0, rel=1e-8)
-        # Against the motion; in space each point slides a little askew, as the mesh is.
+        # Friction opposes the motion; in 3D slip directions vary a little with the mesh.
         against = scene.vector(side=-np.sign(side) * 1.2, up=4.0)
         assert close(r.force, against, 1e-8 if scene.dim == 2 else 2e-3)
     assert np.all(gathered(COMM, contact.slip).sum(axis=1) > 0.1)
@@ -91,9 +91,9 @@ def test_prescribed_normal_traction(cell, method):
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_tresca_friction(cell):
-    """Unilateral contact with a given friction limit: both methods agree, and T ≤ μ p A.
+    """Both methods agree for unilateral contact with a given friction bound, and T ≤ μ p A.
 
-    1e-7 of the largest value, as for Coulomb's law.
+    Tolerance 1e-7 of the largest value, as for Coulomb's law.
     """
     fields = []
     for method in ("lbfgs", "newton"):
@@ -108,8 +108,8 @@ def test_tresca_friction(cell):
 
 
 @pytest.mark.parametrize(("alpha", "phi"), [(1.0, 0.0), (0.5, 0.5), (0.0, 0.0)])
-def test_shares_of_h0_do_not_change_the_solution(alpha, phi):
-    """Whatever part of the contact stiffness is in H₀, the state is the same: 1e-7, as above."""
+def test_contact_stiffness_in_h0_does_not_change_the_solution(alpha, phi):
+    """Solutions do not depend on the contact stiffness that H₀ contains, to 1e-7."""
     reference, made = Rub(), Rub(alpha=alpha, phi=phi)
     for m in (reference, made):
         walk(m, path=PATH[:4])
@@ -119,9 +119,9 @@ def test_shares_of_h0_do_not_change_the_solution(alpha, phi):
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
 def test_patch_with_vertex_quadrature(cell):
-    """Contact springs at the vertices (section 4): they too carry a uniform pressure, 1e-10.
+    """Vertex quadrature (section 4) yields a uniform pressure to 1e-10.
 
-    On facets of degree 1 the springs of a vertex sum to the integral of its hat function.
+    On facets of degree 1 the weights of a vertex sum to the integral of its hat function.
     """
     scene = block(cell, up=-2.0, surface={"quadrature_scheme": "vertex"})
     problem, contact = scene.problem(fc.Frictionless(k_n=5e3), scene.rollers(), petsc_options=TIGHT)
@@ -131,10 +131,10 @@ def test_patch_with_vertex_quadrature(cell):
     assert close(pressure, np.full(len(pressure), 2.0), 1e-10)
 
 
-def test_two_laws_at_once():
-    """Friction on the floor, none at the wall: forces of each, by equilibrium, 1e-8.
+def test_two_contact_laws_in_one_problem():
+    """Forces of a floor with friction and a frictionless wall are in equilibrium to 1e-8.
 
-    The side load 1 is shared by wall and friction; the floor carries the vertical load 2.
+    Wall and friction balance the side load 1, the floor the vertical load 2.
     """
     scene = block("quadrilateral", up=-2.0)
     scene.pull(RIGHT, scene.vector(side=-1.0))
@@ -151,10 +151,10 @@ def test_two_laws_at_once():
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
-def test_loaded_and_unloaded(method):
-    """A block that only its floor holds, loaded and unloaded: no force is left, u returns to zero.
+def test_no_force_remains_after_unloading(method):
+    """Force and deformation of a block that only the floor supports vanish after unloading.
 
-    1e-8 of the displacement under load: what a residual of 1e-9 of the largest force leaves.
+    The force is at most 1e-8; u minus its mean is at most 1e-7 of the displacement under load.
     """
     scene = block("quadrilateral", up=-1.0)
     problem, _ = scene.problem(fc.Frictionless(k_n=1e4), scene.rollers(), method=method)
@@ -165,13 +165,13 @@ def test_loaded_and_unloaded(method):
     step = problem.solve()
     assert step.contacts["contact"].normal_force <= 1e-8
     u = gathered(COMM, owned(scene.u)).reshape(-1, 2)
-    strained = u - u.mean(axis=0)  # free to stand a little above the floor
+    strained = u - u.mean(axis=0)  # the block may be a little above the floor
     assert np.abs(strained).max() <= 1e-7 * size
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
-def test_no_contact_at_all(method):
-    """Without contacts it is a linear solver: a clamped block under its load, ν = 0; 1e-9."""
+def test_problem_without_contacts_is_linear(method):
+    """A block without contacts, under its load with ν = 0, has the exact u to 1e-9."""
     scene = block("quadrilateral", nu=0.0, up=-2.0)
     problem = fc.ContactProblem(
         scene.F, scene.u, bcs=[*scene.rollers(), scene.hold(BOTTOM, 1)], method=method
@@ -182,17 +182,17 @@ def test_no_contact_at_all(method):
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
-def test_lifted_off(method):
-    """A held block pressed and then lifted off its floor: no force, no traction, and pressed again.
+def test_lifting_off_resets_friction(method):
+    """A block lifted off the floor has no contact force and no tangential traction.
 
-    Reference of the second pressing: the first, as the traction of before is forgotten; 1e-8.
+    Pressed again, it has the force of the first pressing to 1e-8: earlier tractions are forgotten.
     """
     scene = block("quadrilateral")
     push = [fem.Constant(scene.mesh, 0.0) for _ in range(2)]
     bcs = [scene.hold(TOP, i, c) for i, c in enumerate(push)]
     problem, contact = scene.problem(fc.Coulomb(0.3, k_n=1e4, k_t=5e3), bcs, method=method)
     forces = []
-    # Straight down; aside, sliding; up and back while in the air; straight down again.
+    # Down; sideways, slipping; up; back without contact; down again.
     for side, up in [(0, -0.01), (0.02, -0.01), (0.02, 0.01), (0, 0.01), (0, -0.01)]:
         push[0].value, push[1].value = side, up
         forces.append(problem.solve().contacts["contact"].force)

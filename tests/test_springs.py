@@ -24,7 +24,7 @@ TIGHT = {"snes_rtol": 1e-13}
 
 
 def rotate(d: int) -> np.ndarray:
-    """A rotation that leaves no axis where it was."""
+    """Return a rotation matrix that changes the direction of every axis."""
     angle = 0.7
     c, s = np.cos(angle), np.sin(angle)
     plane = np.array([[c, -s], [s, c]])
@@ -37,7 +37,7 @@ def rotate(d: int) -> np.ndarray:
 
 
 def dense(matrix: PETSc.Mat, d: int) -> np.ndarray:
-    """All of a matrix on every rank, (n_nodes, n_nodes, d, d); the matrix is destroyed."""
+    """Return a matrix on every rank, shape (n_nodes, n_nodes, d, d), and destroy the original."""
     start, _ = matrix.getOwnershipRange()
     indptr, columns, values = matrix.getValuesCSR()
     rows = start + np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
@@ -50,7 +50,7 @@ def dense(matrix: PETSc.Mat, d: int) -> np.ndarray:
 
 
 def nodes(space: fem.FunctionSpace) -> np.ndarray:
-    """Coordinates of all nodes in the global order, on every rank."""
+    """Return the coordinates of all nodes in the global order, on every rank."""
     n = space.dofmap.index_map.size_local
     return gathered(COMM, space.tabulate_dof_coordinates()[:n, : space.mesh.geometry.dim])
 
@@ -59,10 +59,10 @@ def nodes(space: fem.FunctionSpace) -> np.ndarray:
 @pytest.mark.parametrize("n", [1, 3])
 @pytest.mark.parametrize("cell", CELLS)
 def test_springs_of_an_inclined_surface(cell, n, weight):
-    """Every vertex of Γc has K_n = k n⊗n and K_t = k_t (1 - n⊗n), and nothing else has any.
+    """Every vertex of Γc has K_n = k_n n⊗n and K_t = k_t (1 - n⊗n); all other entries are zero.
 
-    Section 4; on one inclined facet (n = 1) and on facets of all sizes around a vertex, with the
-    contact's weight or without. Round-off 1e-13.
+    Section 4; on one inclined facet (n = 1) and on facets of different sizes around a vertex, with
+    and without the contact's weight. Tolerance 1e-13, round-off.
     """
     d = dimension(cell)
     mesh, tags = block_mesh(cell, n=n, shuffled=True)
@@ -88,7 +88,7 @@ def test_springs_of_an_inclined_surface(cell, n, weight):
             expected[node, node] = block_of_node
         assert close(matrix, expected, 1e-13)
     assert np.count_nonzero(on_surface) == (n + 1) ** (d - 1)
-    # The forces too: a penetration of 0.2 everywhere is a force of 0.2 k at every node.
+    # A uniform penetration of 0.2 causes a force of 0.2 k_n at every node.
     u.x.array[:] = np.tile(0.3 * normal, u.x.array.size // d)
     force = fem.Function(space)
     fc.ContactOperator(contact).add_force(force.x.petsc_vec)
@@ -99,10 +99,9 @@ def test_springs_of_an_inclined_surface(cell, n, weight):
 
 @pytest.mark.parametrize("cell", CELLS)
 def test_springs_between_two_bodies(cell):
-    """Nodes face to face: [[nn, -nn], [-nn, nn]] times k, and the same with t⊗t.
+    """Opposite nodes have the springs k_n [[nn, -nn], [-nn, nn]] and k_t with 1 - n⊗n.
 
-    Section 4, with the pair inclined. Tolerance 1e-9 of k: that of the coordinates by which points
-    are paired.
+    Section 4, on an inclined interface. Tolerance 1e-9 of k, that of the coordinates in pairing.
     """
     d = dimension(cell)
     mesh, tags = two_blocks(cell, (2, 2))
@@ -130,8 +129,8 @@ def test_springs_between_two_bodies(cell):
     assert len(middle) == 2 * 3 ** (d - 1)
 
 
-def test_springs_follow_their_parameters():
-    """Weight and k may change: at the node stays k n⊗n, with the k of now, once it is checked."""
+def test_springs_use_the_present_parameters():
+    """Springs use the present k for any weight; `check_input` refuses the weight 0."""
     mesh, tags = block_mesh("quadrilateral")
     u = fem.Function(displacement_space(mesh, 1))
     surface = fc.ContactSurface(mesh, tags, BOTTOM, **VERTEX)
@@ -147,8 +146,8 @@ def test_springs_follow_their_parameters():
     raised_everywhere(contact.check_input, ValueError, "contact", "area of a vertex", "weight")
 
 
-def test_springs_want_vertices():
-    """Springs on a surface whose points are no vertices; springs of no stiffness."""
+def test_nodal_springs_require_vertex_quadrature_and_positive_k():
+    """`NodalSprings` are refused without vertex quadrature, or if k is not a positive number."""
     scene = block()
     for law in (fc.Frictionless(fc.NodalSprings(1.0)), fc.Coulomb(0.3, k_t=fc.NodalSprings(1.0))):
         raised_everywhere(
@@ -164,12 +163,12 @@ def test_springs_want_vertices():
 
 
 @pytest.mark.parametrize("bulk", ["linear", "rubber"])
-def test_a_spring_that_comes_later_holds(bulk):
-    """A spring in F is raised from zero after the first increment, and let go after the second.
+def test_bulk_spring_added_later_constrains_the_body(bulk):
+    """A spring in F has zero stiffness in the first and third increment, and 100 in the second.
 
-    References: the load aside of 0.5, of which friction bears at most 0.3; the spring bears the
-    rest, and without it nothing does. A free motion was one for good: "no contact force can
-    balance".
+    Reference: the tangential load of 0.5 is balanced by friction, at most 0.3, and the spring, to
+    1e-7; without the spring the solve is refused. Once a rigid-body mode stayed unconstrained
+    after the first increment: "no contact force can balance".
     """
     scene = block("quadrilateral", E=1e3, up=-1.0)
     u, v, k = scene.u, scene.F.arguments()[0], fem.Constant(scene.mesh, 0.0)
@@ -198,11 +197,11 @@ def test_a_spring_that_comes_later_holds(bulk):
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("cell", CELLS)
-def test_a_block_on_a_foundation(cell, method):
-    """A block bonded to a foundation, and nothing else, pressed down, pulled along and lifted.
+def test_block_on_foundation(cell, method):
+    """A block constrained only by a foundation is pressed, pulled tangentially and lifted.
 
-    Reference: balance alone. The mean displacement of the bottom is force/(area k), up and down,
-    and the reactions add up to the load. Tolerance 1e-7: a hundred times the solver's on forces.
+    Reference: equilibrium. The mean jump of the bottom is force/(area k), in both directions, and
+    the contact force is minus the load. Tolerance 1e-7, a hundred times the solver's on forces.
     """
     scene = block(cell)
     problem, contact = scene.problem(fc.Foundation(50.0, 20.0), [], method=method)
@@ -222,10 +221,10 @@ def test_a_block_on_a_foundation(cell, method):
         assert step.verdict.laws["contact"]["stiffness"] <= 1e-10
 
 
-def test_a_foundation_that_does_not_pull():
-    """Without tension: pressed it carries the load and holds, and it cannot carry one that lifts.
+def test_foundation_without_tension():
+    """A foundation without tension balances pressure and sticks; a lifting load is refused.
 
-    Tolerance 1e-7: a hundred times the solver's on forces.
+    Tolerance 1e-7, a hundred times the solver's on forces.
     """
     scene = block("quadrilateral", up=-2.0)
     law = fc.Foundation(50.0, 20.0, tension=False)
@@ -239,8 +238,8 @@ def test_a_foundation_that_does_not_pull():
     raised_everywhere(problem.solve, ValueError, "balance")
 
 
-def test_a_foundation_without_tangential_stiffness_has_no_tangential_state():
-    """k_t = 0: no tractions along Γc, no history of them, and nothing holds the body there."""
+def test_foundation_without_tangential_stiffness_has_no_slip_history():
+    """With k_t = 0 there are no tangential tractions or history, nor is the body constrained."""
     scene = block("quadrilateral", up=0.5)
     raised_everywhere(
         lambda: scene.problem(fc.Foundation(50.0), []), ValueError, "translation along x"
@@ -254,8 +253,8 @@ def test_a_foundation_without_tangential_stiffness_has_no_tangential_state():
 
 
 @pytest.mark.parametrize("tension", [True, False])
-def test_a_foundation_that_is_not_everywhere(tension):
-    """Nothing by UFL on half of Γc is as Γc without that half: forces and displacements, 1e-8."""
+def test_foundation_on_half_of_the_surface(tension):
+    """Zero stiffness by UFL on half of Γc gives the solution of Γc without that half, to 1e-8."""
     found = []
     for everywhere in (True, False):
         scene = block("quadrilateral", n=4, up=-2.0)
@@ -278,11 +277,11 @@ def test_a_foundation_that_is_not_everywhere(tension):
 
 @pytest.mark.parametrize("tension", [True, False])
 @pytest.mark.parametrize("constant", [False, True])
-def test_a_foundation_that_is_not_there(tension, constant):
-    """Stiffness zero, as a number or by a constant: no force, and nothing that bears a load.
+def test_foundation_of_zero_stiffness(tension, constant):
+    """A foundation of zero stiffness, a number or a constant, has no force and no constraint.
 
-    Reference: a block hung up at its top is free of stress: u = 0 exactly. Pressed with nothing to
-    hold it, it is refused by the load that nothing bears.
+    Reference: an unloaded block fixed at its top has u = 0 exactly. A vertical load on a block
+    with no other vertical constraint is refused.
     """
     scene = block("quadrilateral")
     k = fem.Constant(scene.mesh, 0.0) if constant else 0.0
@@ -294,24 +293,24 @@ def test_a_foundation_that_is_not_there(tension, constant):
     problem, _ = scene.problem(fc.Foundation(k, tension=tension), [scene.hold(LEFT, 0)])
     scene.load(up=-1.0)
     raised_everywhere(problem.solve, ValueError, "no contact force can balance", "along y")
-    if constant:  # again, once there is something
+    if constant:  # solvable with a positive stiffness
         k.value = 50.0
         assert problem.solve().contacts["contact"].normal_force == pytest.approx(1.0, abs=1e-7)
 
 
 @pytest.mark.parametrize("what", ["pull", "normal", "tangential"])
-def test_a_foundation_that_lies_is_caught(what):
-    """Reactions that are not those of the stiffness do not pass the verdict."""
+def test_verdict_rejects_wrong_foundation_tractions(what):
+    """The verdict rejects tractions that differ from those of the foundation's stiffness."""
 
     class Changed(fc.Foundation):
-        """A foundation with one reaction 1 % wrong, or none where it should pull."""
+        """A foundation with one traction 1 % wrong, or without tension."""
 
         def parameters(self):
-            """Those of the foundation."""
+            """Return the stiffnesses of the foundation."""
             return {"k_n": 50.0, "k_t": 20.0}
 
         def contact_traction(self, kinematics, parameters):
-            """The foundation's, changed."""
+            """Return the tractions of the foundation, modified."""
             r = super().contact_traction(kinematics, parameters)
             r_n, tau = r.normal_traction, r.traction
             if what == "pull":
@@ -335,7 +334,7 @@ def test_a_foundation_that_lies_is_caught(what):
 
 ALONG = np.array([np.cos(0.5), np.sin(0.5)])
 SLIDING = {
-    # All slip is along e: τ is where the ellipse has the normal -e, at its vertex in a polygon.
+    # All slip is along e: τ is the point of the ellipse with the normal -e, a vertex of a polygon.
     "ellipse": (
         {"transverse_friction": 0.1, "direction": (1.0, 0.0, 5.0)},
         np.array([0.3, 0.1]) ** 2 * ALONG / np.linalg.norm(np.array([0.3, 0.1]) * ALONG),
@@ -352,13 +351,13 @@ SLIDING = {
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("kind", SLIDING)
 @pytest.mark.parametrize("cell", ["tetrahedron", "hexahedron"])
-def test_sliding_aslant(cell, kind, method):
-    """A block pressed on a floor and pushed aslant: friction is not against the motion.
+def test_sliding_direction_of_anisotropic_friction(cell, kind, method):
+    """A sliding block with anisotropic friction has a friction force not opposite to its motion.
 
-    Reference: once all of it slides (or is lifted at the rear), τ = -p times the point of the law's
-    surface (of limit one) where slip is along the motion, so that it is with the forces. Tolerance
-    1e-6: the elastic share of an increment is 1 % of it, and what is left of its direction falls so
-    at each of five.
+    Reference: when all closed points slip, τ = -p times the point of the friction surface (for
+    p = 1) whose normal is the direction of the motion, and so is the ratio of the forces. Tolerance
+    1e-6: the elastic part is 1 % of an increment, and the error of the direction decreases by this
+    factor in each of five increments.
     """
     options, expected = SLIDING[kind]
     scene = block(cell)
@@ -382,27 +381,27 @@ def test_sliding_aslant(cell, kind, method):
     ("what", "claim"),
     [("nothing", ""), ("metric", "slip"), ("friction", "cone"), ("modes", "dissipation")],
 )
-def test_an_anisotropic_law_that_lies_is_caught(what, claim):
-    """Traction and slip of the ellipse, or of a polygon, against another surface or metric."""
+def test_verdict_rejects_wrong_anisotropic_law(what, claim):
+    """The verdict rejects tractions and slip of another friction surface or metric."""
     options = {"modes": 5} if what == "modes" else {"transverse_friction": 0.1}
 
     class Changed(fc.Coulomb):
-        """A law whose return map is not that of what it claims."""
+        """A law whose return map differs from its parameters or yield functions."""
 
         def parameters(self):
-            """Those of Coulomb's law."""
+            """Return the parameters of Coulomb's law with the options of this test."""
             return fc.Coulomb(
                 self.friction, self.k_n, self.k_t, direction=self.direction, **options
             ).parameters()
 
         def tangential_stiffness(self, kinematics, parameters):
-            """In one case as without the stretch."""
+            """Return the isotropic stiffness in the case "metric"."""
             if what == "metric":
                 return fc.Law.tangential_stiffness(self, kinematics, parameters)
             return super().tangential_stiffness(kinematics, parameters)
 
         def yield_functions(self, kinematics, traction, limit, parameters):
-            """In two cases of less friction across, or of other sides."""
+            """Return those of less transverse friction or permuted sides, in two cases."""
             if what == "friction":
                 less = 0.9 * parameters["transverse_friction"]
                 parameters = dict(parameters) | {"transverse_friction": less}

@@ -1,4 +1,4 @@
-"""Load histories: loads as functions, cutting, energies, and going on after the end of a run."""
+"""Load histories: loads as functions, cut increments, energies, and restart from checkpoints."""
 
 import io
 import json
@@ -29,8 +29,8 @@ COMM = MPI.COMM_WORLD
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_loads_as_a_function(cell):
-    """A cycle of two loads by one function: the friction force returns to its opposite."""
+def test_one_function_can_set_several_loads(cell):
+    """In a cycle of two loads set by one function the friction force is reversed."""
     made = Rub(cell=cell)
     shear = {}
     for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=8):
@@ -42,8 +42,8 @@ def test_loads_as_a_function(cell):
     assert close(end.tangential_force, 0.3 * end.normal_force, 1e-12)
 
 
-def test_ends_of_increments_as_given():
-    """Increments of unequal size end where they were told to."""
+def test_increments_end_at_the_given_loads():
+    """Increments of unequal size end at the given loads."""
     made = Rub()
     steps = fc.increments(made.problem, made.load, 0.0, 2.0, steps=[0.5, 1.0, 1.1, 2.0])
     assert [s.load for s in steps] == [0.5, 1.0, 1.1, 2.0]
@@ -64,8 +64,8 @@ def test_ends_of_increments_as_given():
         (None, ["half", 1.0], "ends of the increments"),
     ],
 )
-def test_wrong_histories(load, steps, word):
-    """A load that is none, increments that lead nowhere or to and fro."""
+def test_invalid_histories_are_refused(load, steps, word):
+    """Refused are a load that is no load, and increments that are not monotonic or miss the end."""
     made = Rub()
     call = lambda: list(  # noqa: E731
         fc.increments(made.problem, load or made.load, 0.0, 1.0, steps=steps)
@@ -74,14 +74,14 @@ def test_wrong_histories(load, steps, word):
 
 
 @pytest.mark.parametrize(("start", "end"), [(0.0, 5e-324), (1e16, 1e16 + 2), (-1e308, 1e308)])
-def test_increments_that_numbers_cannot_tell_apart(start, end):
-    """Three were asked for; fewer would be solved, by another way of the load."""
+def test_increments_below_round_off_are_refused(start, end):
+    """Fewer than the three increments asked for would be another load path."""
     made = Rub()
     call = lambda: fc.increments(made.problem, made.load, start, end, steps=3)  # noqa: E731
     raised_everywhere(call, ValueError, "steps is 3", "distinguished")
 
 
-def test_one_file_for_checkpoint_and_table(tmp_path):
+def test_same_file_for_checkpoint_and_csv_is_refused(tmp_path):
     """Each would overwrite the other; nothing is written."""
     made, path = Rub(), shared_folder(tmp_path) / "state"
     names = {"checkpoint": path, "csv": path.parent / ".." / path.parent.name / "state"}
@@ -93,21 +93,21 @@ def test_one_file_for_checkpoint_and_table(tmp_path):
 # ---- cutting -------------------------------------------------------------------------------------
 
 
-def test_failed_increments_are_cut_and_grow_again():
-    """Halved until they pass, doubled after two successes, all asked for is met."""
+def test_failed_increments_are_cut_and_enlarged_again():
+    """Increments are halved until they converge, doubled after two successes, and reach the end."""
     made, plain = Rub(), Rub()
     tried = limited(made, 0.3)
     done = [s.load for s in fc.increments(made.problem, made.load, 0.0, 2.0, steps=2)]
     assert done[-1] == 2.0 and 1.0 in done
     assert np.all(np.diff([0.0, *done]) <= 0.3)
-    assert len(tried) > len(done)  # it failed, and tried to grow
+    assert len(tried) > len(done)  # increments failed, also after growth
     asked = list(fc.increments(plain.problem, plain.load, 0.0, 2.0, steps=done))
     assert made.problem.increment == len(asked) == len(done)
     assert same_states(made, plain, 1e-7)
 
 
-def test_cutting_has_a_limit():
-    """What never converges is given up, and leaves everything as committed."""
+def test_number_of_cuts_is_limited():
+    """An increment that never converges raises the error, and the committed state is unchanged."""
     made = Rub()
     limited(made, 0.0)
     with pytest.raises(fc.NotConverged):
@@ -123,7 +123,7 @@ def test_cutting_has_a_limit():
 @pytest.mark.parametrize("law", [fc.Frictionless(k_n=2e4), fc.Coulomb(0.3, k_n=2e4, k_t=1e4)])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_energy_is_balanced(cell, law):
-    """Equilibrium at both ends makes the balance exact, up to the solver's tolerance of 1e-9."""
+    """With equilibrium at both ends the balance is exact, up to 1e-6 by the solver's 1e-9."""
     made = Rub(law, cell=cell)
     for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=8):
         e = step.energy
@@ -135,8 +135,8 @@ def test_energy_is_balanced(cell, law):
             assert e.dissipation == 0.0
 
 
-def test_what_energy_leaves_out_vanishes_with_the_increments():
-    """The remainder, taken absolutely, more than halves with the increments: second order."""
+def test_energy_remainder_converges_with_the_increments():
+    """The sum of absolute remainders more than halves when the increments are halved."""
     shares = []
     for n in (8, 16, 32):
         made = Rub()
@@ -150,7 +150,7 @@ def test_what_energy_leaves_out_vanishes_with_the_increments():
 
 @pytest.mark.parametrize("field", [True, False])
 def test_energy_of_a_driven_obstacle(field):
-    """A weight's work goes into the block and the springs: P²/2 (1/k_n + 1/E), all of it."""
+    """The work of a weight is stored in the block and the springs: P²/2 (1/k_n + 1/E), to 1e-7."""
     scene = block("quadrilateral", 1, n=2, nu=0.0)
     force = fem.Constant(scene.mesh, 0.0)
     floor = scene.floor(displacement=fc.Motion(force=(None, force)))
@@ -169,8 +169,8 @@ def test_energy_of_a_driven_obstacle(field):
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 @pytest.mark.parametrize("every", [1, 3])
-def test_going_on_gives_the_same_digits(cell, method, every, tmp_path):
-    """A history broken off after 5 of 8 increments and taken up by a new problem, bit for bit."""
+def test_restart_gives_identical_digits(cell, method, every, tmp_path):
+    """A history interrupted after 5 of 8 increments is restarted by a new problem, bit for bit."""
     folder = shared_folder(tmp_path)
     whole, broken, after = (Rub(cell=cell, method=method) for _ in range(3))
     options = {"steps": 8, "checkpoint_every": every}
@@ -194,8 +194,8 @@ def test_going_on_gives_the_same_digits(cell, method, every, tmp_path):
     assert same_states(again, whole, SAME)
 
 
-def test_a_file_of_another_problem_is_refused(tmp_path):
-    """Other meshes and contacts are told from the file, and nothing is changed."""
+def test_checkpoint_of_another_problem_is_refused(tmp_path):
+    """The checkpoint of another mesh is refused, and nothing is changed."""
     path = shared_folder(tmp_path) / "state.npz"
     made = Rub()
     list(fc.increments(made.problem, made.load, 0.0, 1.0, checkpoint=path))
@@ -207,19 +207,19 @@ def test_a_file_of_another_problem_is_refused(tmp_path):
 
 
 class LossyFile(io.FileIO):
-    """A file that loses the last byte of all that it is given."""
+    """A file that loses the last byte of everything written to it."""
 
     def write(self, content):
-        """Write all but that."""
+        """Write all bytes but the last."""
         super().write(bytes(content)[:-1])
         return len(content)
 
 
 @pytest.mark.parametrize("said", [True, False])
-def test_a_failed_write_leaves_the_old_file(said, tmp_path, monkeypatch):
-    """A full disk: every rank gets the error, the last file and the state are as they were.
+def test_failed_write_keeps_the_previous_checkpoint(said, tmp_path, monkeypatch):
+    """If the disk is full, all ranks raise the error, and the last file and state are unchanged.
 
-    So does a disk that says nothing and loses a byte: the file is read back.
+    The same holds for a disk that loses a byte without an error, because the file is read back.
     """
     path = shared_folder(tmp_path) / "state.npz"
     made = Rub()
@@ -262,9 +262,9 @@ if first:
 
 
 def run_script(path: Path, ranks: int, *, kill_after: int | None = None) -> list[str]:
-    """Run the history in a process of its own, killed after so many increments.
+    """Run the history in a separate process, killed after ``kill_after`` increments if given.
 
-    One rank alone speaks: lines of several ranks arrive in any order.
+    Only one rank prints, because lines of several ranks arrive in any order.
     """
     script = SCRIPT.format(path=str(path))
     words = command(ranks, "-c", script)
@@ -283,10 +283,10 @@ def run_script(path: Path, ranks: int, *, kill_after: int | None = None) -> list
 
 @pytest.mark.skipif(COMM.size > 1, reason="starts its own processes")
 @pytest.mark.parametrize("ranks", [(1, 1), (1, 2)])
-def test_killed_and_started_again(ranks, tmp_path):
-    """Kill -9 in the middle: the second run ends with the digits of one that was let alone.
+def test_restart_of_a_killed_process(ranks, tmp_path):
+    """After SIGKILL the second run ends with the same digits as an uninterrupted one.
 
-    On another number of ranks with those of the solver's tolerance (1e-9, pressures to 1e-6).
+    On another number of ranks pressures agree to 1e-6, by the solver's tolerance of 1e-9.
     """
     first, second = ranks
     alone = run_script(tmp_path / "alone.npz", first)

@@ -1,4 +1,4 @@
-"""Histories whose field is found last, at some increments, or on request."""
+"""Histories whose interior is recovered at the end, at some increments, or on request."""
 
 import numpy as np
 import pytest
@@ -16,18 +16,18 @@ COMM = MPI.COMM_WORLD
 
 
 def lagging(field, tmp_path=None, *, law=None, steps=8, **kwargs):
-    """The history with the field found when ``field`` says."""
+    """Run the history with ``recover_interior=field``."""
     made = Rub(law, cell="hexahedron", condensation=True)
     options = {"steps": steps, "recover_interior": field} | kwargs
     return made, list(fc.increments(made.problem, made.load, 0.0, 4.0, **options))
 
 
 @pytest.mark.parametrize("law", [fc.Frictionless(k_n=2e4), fc.Coulomb(0.3, k_n=2e4, k_t=1e4)])
-def test_field_at_the_last_increment(law):
-    """The same forces, energies and final field as with all fields found.
+def test_interior_recovered_at_the_last_increment(law):
+    """Forces, energies and the final field are those with the interior of all increments.
 
-    Both solve to 1e-9 of the forces, and eight increments add up: 1e-7, which energies have of the
-    larger of work and elastic energy. The top moves: prescribed values that change do work.
+    Both are solved to 1e-9 of the forces, and errors of eight increments add up: 1e-7, relative to
+    work plus elastic energy for energies. The top moves, so that prescribed values do work.
     """
     every, all_steps = lagging("every", law=law)
     last, steps = lagging("last", law=law)
@@ -43,10 +43,10 @@ def test_field_at_the_last_increment(law):
         assert a.verdict.failures == [] and a.verdict.laws.keys() == {"contact"}
 
 
-def test_field_on_request():
-    """`complete` brings u to what it is where all fields are found (1e-7), and then has no work.
+def test_complete_recovers_the_interior_on_request():
+    """`complete` sets u to that of a history with all interiors (1e-7); a second call does nothing.
 
-    What the contact says of the increment stays: what slipped in it is not said to stick.
+    The status of the contact in the increment is unchanged: points that slipped do not stick.
     """
     every, lazy = Rub(cell="triangle", condensation=True), Rub(cell="triangle", condensation=True)
     compared = 0
@@ -69,7 +69,7 @@ def test_field_on_request():
 
 
 def stiffening(field: str) -> tuple[Rub, list[fc.Step]]:
-    """A history in which the stiffness of bulk and contact changes with the load."""
+    """Run a history in which the stiffness of bulk and contact changes with the load."""
     made = Rub(cell="triangle", condensation=True)
 
     def load(t: float) -> None:
@@ -80,8 +80,8 @@ def stiffening(field: str) -> tuple[Rub, list[fc.Step]]:
     return made, list(fc.increments(made.problem, load, 0.0, 2.0, steps=4, recover_interior=field))
 
 
-def test_field_left_behind_while_bulk_and_law_change():
-    """What was left behind is completed with the data it was found with: the same to 1e-7."""
+def test_pending_interior_uses_the_data_of_its_increment():
+    """A pending interior is recovered with bulk and law of its increment: forces and u, 1e-7."""
     (every, all_found), (lazy, lagging) = stiffening("every"), stiffening("last")
     assert not any(attempt.method == "cut" for s in lagging for attempt in s.attempts)
     assert not lagging[0].complete
@@ -93,10 +93,10 @@ def test_field_left_behind_while_bulk_and_law_change():
 
 
 @pytest.mark.parametrize("last", [True, False], ids=["found", "behind"])
-def test_solution_dropped_with_the_bulk_it_was_found_with(last):
-    """The committed field is behind, a solution was not committed, and the bulk is another one.
+def test_uncommitted_solution_is_discarded_after_bulk_changes(last):
+    """The committed interior is pending, a solution was not committed, and then the bulk changes.
 
-    Reference: the same increments with all fields found, 1e-7.
+    Reference: the same increments with all interiors recovered, 1e-7.
     """
     states = []
     for first, second in ((True, True), (False, last)):
@@ -118,14 +118,14 @@ def test_solution_dropped_with_the_bulk_it_was_found_with(last):
     assert np.isclose(one.elastic, other.elastic, rtol=1e-6)
 
 
-def test_field_every_so_many_increments():
-    """Every third and the last; a checkpoint has all of u."""
+def test_interior_recovered_every_third_increment():
+    """With ``recover_interior=3`` every third increment and the last one are complete."""
     _, steps = lagging(3)
     assert [s.complete for s in steps] == [False, False, True, False, False, True, False, True]
 
 
-def test_checkpoint_of_a_field_left_behind(tmp_path):
-    """Going on from a file gives the digits of the run that wrote it."""
+def test_checkpoint_with_a_pending_interior(tmp_path):
+    """A history restarted from a checkpoint has the states of an uninterrupted one."""
     folder = shared_folder(tmp_path)
     whole, _ = lagging("last", checkpoint=folder / "whole.npz", checkpoint_every=3)
     made = Rub(cell="hexahedron", condensation=True)
@@ -140,8 +140,8 @@ def test_checkpoint_of_a_field_left_behind(tmp_path):
     assert same_states(after, whole, SAME)
 
 
-def test_a_failure_leaves_the_field_to_be_completed():
-    """After an increment that fails u is completed as that of the last commit."""
+def test_failed_increment_recovers_the_committed_interior():
+    """When an increment fails, the interior of u is recovered for the last commit, 1e-7."""
     every, lazy = Rub(cell="triangle", condensation=True), Rub(cell="triangle", condensation=True)
     limited(lazy, 0.6)
     for made in (every, lazy):
@@ -161,8 +161,8 @@ def test_a_failure_leaves_the_field_to_be_completed():
     assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
 
 
-def test_a_failure_leaves_what_was_solved_and_not_committed():
-    """Its field is completed with its own tractions, and its results are shown."""
+def test_failed_solve_keeps_the_uncommitted_solution():
+    """A failed solve keeps an uncommitted solution; its interior can be recovered, 1e-7."""
     every, lazy = Rub(cell="triangle", condensation=True), Rub(cell="triangle", condensation=True)
     for made in (every, lazy):
         for t in (0.5, 1.5):
@@ -180,8 +180,8 @@ def test_a_failure_leaves_what_was_solved_and_not_committed():
     assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
 
 
-def test_a_field_that_is_wrong_is_refused(monkeypatch):
-    """What is recovered is checked by the product with K, not by what recovered it."""
+def test_wrong_recovered_interior_is_refused(monkeypatch):
+    """A recovered interior is verified by the product with K, not by its own factors."""
     made = Rub(cell="triangle", condensation=True)
     made.load(1.0)
     made.problem.solve(recover_interior=False)
@@ -192,8 +192,8 @@ def test_a_field_that_is_wrong_is_refused(monkeypatch):
         made.problem.complete()
 
 
-def test_wrong_field():
-    """No such choice."""
+def test_wrong_recover_interior_is_refused():
+    """An unknown value of ``recover_interior`` raises an error."""
     made = Rub()
     for field in ("never", 0, 1.5):
         call = lambda field=field: list(  # noqa: E731
@@ -202,8 +202,8 @@ def test_wrong_field():
         raised_everywhere(call, ValueError, "every")
 
 
-def test_a_body_that_no_contact_touches_beside_one_that_lags():
-    """It has no retained dof, and the sum of forces on these is 0 of 0; all of it balances."""
+def test_body_without_contact_balances_with_a_pending_interior():
+    """A body without retained dofs, whose forces on these are 0 of 0, balances before and after."""
     scene = Beside({"block": Box(), "other": Box((3.0, 0.0))})
     scene.hold("block", TOP, 0, 1, value=-1e-3)
     scene.hold("other", BOTTOM, 0, 1)

@@ -1,9 +1,8 @@
 """Stiff contact with friction: Newton's method, and the primal-dual method where it fails.
 
-What is found is compared with solutions by minimum problems (the alternation), whose matrices, line
-search and limits of friction are others, and with continuation alone. All satisfy the law to 1e-9
-of the forces, and at 1e4 E/h displacements of Γc are known to some hundred times that: states agree
-to 1e-6.
+References are solutions by minimum problems (method "alternating"), which have other matrices, line
+search and friction bounds, and by continuation. All satisfy the law to 1e-9 of the forces; at
+1e4 E/h the displacements of Γc are known to about a hundred times that: states agree to 1e-6.
 """
 
 import dataclasses
@@ -30,8 +29,8 @@ def coulomb(k, friction=0.3, **others):
 @pytest.mark.parametrize(
     ("cell", "degree"), [("triangle", 1), ("quadrilateral", 2), ("tetrahedron", 1)]
 )
-def test_the_same_solution(cell, degree, k):
-    """However stiff."""
+def test_solution_agrees_with_minimum_problems_at_any_stiffness(cell, degree, k):
+    """At any stiffness Newton's method finds the solution of the minimum problems, to 1e-6."""
     states = []
     for method in ("newton", "alternating"):
         scene, problem, _ = pressed(cell, coulomb(k), method, degree=degree, n=3, side=0.06)
@@ -51,8 +50,8 @@ def test_the_same_solution(cell, degree, k):
     ],
     ids=["polygon", "ellipse", "Tresca", "soft along Γc"],
 )
-def test_other_laws(law):
-    """Return maps of other yield surfaces, and springs that are not alike."""
+def test_other_laws_agree_with_minimum_problems(law):
+    """Other friction surfaces and k_n ≠ k_t have the solution of the minimum problems, to 1e-6."""
     states = []
     for method in ("newton", "alternating"):
         scene, problem, _ = pressed("hexahedron", law, method, n=3, side=0.06)
@@ -62,8 +61,8 @@ def test_other_laws(law):
 
 
 @pytest.mark.parametrize("condensation", [True, False])
-def test_to_and_fro(condensation):
-    """A history with reversals, each increment from the last: as by continuation."""
+def test_load_reversals_agree_with_continuation(condensation):
+    """A history with load reversals agrees with that of continuation, to 1e-6."""
     ends = []
     for method in ("newton", "continuation"):
         rub = Rub(coulomb(1e3), mesh={"n": 8}, reach=0.05, method=method, condensation=condensation)
@@ -75,8 +74,8 @@ def test_to_and_fro(condensation):
 
 
 @SERIAL
-def test_in_space_by_multigrid():
-    """The ball on a block, where nothing is factored: as by default and by continuation."""
+def test_multigrid_in_space():
+    """With multigrid L-BFGS, Newton and continuation agree on the force of a ball, to 1e-8."""
     ends = []
     for options in ({}, {"method": "newton"}, {"method": "continuation"}):
         body = dataclasses.replace(problems.ball_on_block(8), friction=0.3)
@@ -92,8 +91,8 @@ def test_in_space_by_multigrid():
 
 @SERIAL
 @pytest.mark.parametrize("k", [2e3, 2e4])
-def test_in_the_plane_by_multigrid(k):
-    """As by continuation, whose systems are solved alike."""
+def test_multigrid_in_the_plane(k):
+    """With multigrid Newton's method agrees with continuation, to 1e-6."""
     ends = []
     for method in ("newton", "continuation"):
         rub = Rub(
@@ -112,10 +111,10 @@ def test_in_the_plane_by_multigrid(k):
     assert close(*ends, 1e-6)
 
 
-def test_between_two_bodies():
-    """Pairs found anew as one block slides on another: pressed, and dragged until all of it slips.
+def test_sliding_between_two_bodies():
+    """A block is pressed on another and dragged, with updates of pairs, until all points slip.
 
-    Forces as by minimum problems, to 1e-7: both residuals are below 1e-9 of them.
+    Reference: forces by minimum problems, to 1e-7; both residuals are below 1e-9 of them.
     """
     forces = []
     for method in ("newton", "alternating"):
@@ -128,11 +127,11 @@ def test_between_two_bodies():
     assert close(*forces, 1e-7)
 
 
-def test_under_multipliers():
-    """Rounds that begin where the last one ended: forces are those with springs of 10 E/h.
+def test_multipliers_with_stiff_springs():
+    """Augmentations with springs of 300 E/h give the forces of those with 10 E/h, to 1e-4.
 
-    Multipliers leave 1e-7 of the tractions to springs, whatever these are; friction that points
-    have spent on their way there differs by as much as they moved: 1e-4.
+    The penalty part is 1e-7 of the tractions for both, but points slip differently during the
+    augmentations, which changes friction by up to 1e-4.
     """
     found = []
     for k in (10.0, 300.0):
@@ -144,8 +143,8 @@ def test_under_multipliers():
     assert close(found[0].tangential_force, found[1].tangential_force, 1e-4)
 
 
-def test_in_other_units():
-    """The same effort."""
+def test_iterations_are_independent_of_units():
+    """The iterations of all attempts are the same in N-mm and in SI units."""
     made = []
     for length, pressure in ((1.0, 1.0), (1e-3, 1e6)):
         rub = Rub(coulomb(1e3), mesh={"n": 8}, length=length, pressure=pressure, method="newton")
@@ -157,11 +156,11 @@ def test_in_other_units():
 @pytest.mark.parametrize(
     ("cell", "k"), [("triangle", 1e3), ("triangle", 1e5), ("triangle", 1e9), ("tetrahedron", 1e3)]
 )
-def test_tractions_as_unknowns_from_a_cold_start(cell, k):
-    """The primal-dual method alone, in the plane at any stiffness.
+def test_primal_dual_method_from_zero_initial_guess(cell, k):
+    """The primal-dual method converges without fallback, in the plane at any stiffness.
 
-    Reference: the same at 1e3 E/h by minimum problems, whose penetration, a thousandth of a cell,
-    moves the force by as much, and by 2e-2 where points that slipped may stick.
+    Reference: the force by minimum problems at 1e3 E/h, to 2e-2. The penetration there, a
+    thousandth of a cell, changes the force by as much, and by up to 2e-2 if slip points stick.
     """
     forces = []
     for stiffness, method in ((1e3, "alternating"), (k, "primal_dual")):
@@ -176,8 +175,8 @@ def test_tractions_as_unknowns_from_a_cold_start(cell, k):
 @pytest.mark.parametrize(
     "case", ["no friction", "an obstacle that is moved by a force", "a nonlinear bulk"]
 )
-def test_what_tractions_as_unknowns_are_not_for_is_refused(case):
-    """By the method's name, before any work."""
+def test_primal_dual_method_refuses_unsupported_problems(case):
+    """Problems that the primal-dual method cannot solve are refused when they are created."""
     scene = block("triangle", n=2)
     law, obstacle, form = coulomb(10.0), cushion(2), scene.F
     if case == "no friction":

@@ -1,4 +1,4 @@
-"""ContactSurface: facets, measure, quadrature points; ghosts and ranks without contact."""
+"""ContactSurface: facets, measure and quadrature points; ghosts and ranks without contact."""
 
 import basix
 import dolfinx
@@ -43,7 +43,7 @@ COMM = MPI.COMM_WORLD
 
 
 def contact_on(surface: fc.ContactSurface, degree: int) -> fc.Contact:
-    """The cheapest contact: its evaluation gives the coordinates of the points."""
+    """Return a cheap contact, whose evaluation gives the coordinates of the points."""
     d = surface.mesh.geometry.dim
     u = fem.Function(displacement_space(surface.mesh, degree))
     up = np.eye(d)[-1]
@@ -51,7 +51,7 @@ def contact_on(surface: fc.ContactSurface, degree: int) -> fc.Contact:
 
 
 def facet_rule(cell: str, degree: int) -> tuple[np.ndarray, np.ndarray, basix.CellType]:
-    """Gauss points and weights on the reference facet, straight from basix."""
+    """Return Gauss points and weights on the reference facet from basix."""
     facet = {"triangle": "interval", "quadrilateral": "interval"}.get(
         cell, {"tetrahedron": "triangle", "hexahedron": "quadrilateral"}.get(cell)
     )
@@ -61,11 +61,11 @@ def facet_rule(cell: str, degree: int) -> tuple[np.ndarray, np.ndarray, basix.Ce
 
 
 def facet_vertices(mesh: dolfinx.mesh.Mesh, facets: np.ndarray) -> np.ndarray:
-    """Coordinates of the vertices of facets, shape (n_facets, n_vertices, gdim)."""
+    """Return the coordinates of the vertices of facets, shape (n_facets, n_vertices, gdim)."""
     d = mesh.geometry.dim
     mesh.topology.create_connectivity(d - 1, d)
     mesh.topology.create_connectivity(d, d - 1)
-    if not facets.size:  # DOLFINx 0.9 does not survive an empty list
+    if not facets.size:  # DOLFINx 0.9 crashes on an empty list
         return np.zeros((0, 2, d))
     return mesh.geometry.x[dolfinx.mesh.entities_to_geometry(mesh, d - 1, facets), :d]
 
@@ -73,7 +73,7 @@ def facet_vertices(mesh: dolfinx.mesh.Mesh, facets: np.ndarray) -> np.ndarray:
 def expected_points(
     mesh: dolfinx.mesh.Mesh, facets: np.ndarray, rule: tuple
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rule pushed to flat facets by their vertices, in numpy: points and weights of this rank."""
+    """Map the rule to flat facets by their vertices, in numpy: points and weights of this rank."""
     points, weights, kind = rule
     d = mesh.geometry.dim
     shape = basix.create_element(basix.ElementFamily.P, kind, 1).tabulate(1, points)
@@ -91,7 +91,7 @@ def expected_points(
 @pytest.mark.parametrize("ghost_mode", [GhostMode.none, GhostMode.shared_facet])
 @pytest.mark.parametrize(("cell", "degree"), GRID)
 def test_points_and_weights_are_those_of_gauss(cell, degree, ghost_mode):
-    """The points are the Gauss points of degree 2p, each once; reference: basix pushed by numpy.
+    """The points are the Gauss points of degree 2p, each once; reference: basix and numpy.
 
     Tolerance 1e-12: round-off of a quotient of two assembled sums of size one.
     """
@@ -129,8 +129,8 @@ def test_facets_are_those_with_the_tags(cell):
         assert abs(weights.sum() - len(tags_wanted)) <= 1e-13 * len(tags_wanted)
 
 
-def test_one_tag_and_a_list_of_it_are_the_same():
-    """``tags`` may be a number or a sequence."""
+def test_tags_can_be_a_number_or_a_sequence():
+    """A tag and a list of it give the same facets."""
     mesh, tags = block_mesh("triangle")
     one = fc.ContactSurface(mesh, tags, BOTTOM)
     listed = fc.ContactSurface(mesh, tags, [BOTTOM])
@@ -152,7 +152,7 @@ def test_quadrature_degree_is_settable(cell):
     assert COMM.allreduce(contact.quadrature.n_points) == len(rule[1]) * n_facets
     moment = COMM.allreduce(float(contact.quadrature.weights @ contact.points[:, 0] ** 5))
     assert abs(moment - 1 / 6) <= 1e-13
-    # The default rule of degree 2 cannot do that: the degree has an effect.
+    # The default rule of degree 2 is not exact: the degree has an effect.
     coarse = contact_on(fc.ContactSurface(mesh, tags, BOTTOM), 1)
     moment = COMM.allreduce(float(coarse.quadrature.weights @ coarse.points[:, 0] ** 5))
     assert abs(moment - 1 / 6) > 1e-5
@@ -175,7 +175,7 @@ def test_vertex_scheme_has_its_points_at_the_vertices(cell):
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
 def test_ranks_without_contact_facets(cell):
-    """Γc on the first rank only: the others hold no point, and all results are the same there."""
+    """If Γc is on one rank only, the others have no points, and all ranks the same results."""
     d = dimension(cell)
     counts = (1, 6) if d == 2 else (1, 1, 6)
     mesh, tags = block_mesh(cell, n=counts, partitioner=layers(cell))
@@ -195,17 +195,17 @@ def test_ranks_without_contact_facets(cell):
     form = compiled(contact.form(ufl.TestFunction(contact.u.function_space)), contact)
     vector = fem.Function(contact.u.function_space)
     fem.assemble_vector(vector.x.array, form)
-    # The residual holds minus the force on the body.
+    # The residual is minus the force on the body.
     total = COMM.allreduce(float(vector.x.array.reshape(-1, d)[:, -1].sum()))
     assert abs(total + 0.25) <= 1e-14
 
 
 @pytest.mark.parametrize("cell", CELLS)
 def test_curved_geometry(cell):
-    """Cells of geometric degree 2 over a parabolic bottom: the points lie on it, the area is its.
+    """Points and area of cells of geometric degree 2 are those of a parabolic bottom.
 
-    Height y = c x² is what quadratic cells of equal width represent, so that the points are exact,
-    1e-12; the arc length by the rule of degree 12 against the formula: 1e-6, the error of the rule.
+    Quadratic cells of equal width represent the height y = c x² exactly: points agree to 1e-12. The
+    arc length by the rule of degree 12 agrees with the formula to 1e-6, the error of the rule.
     """
     c, d = 0.3, dimension(cell)
 
@@ -231,18 +231,18 @@ def test_curved_geometry(cell):
     assert close(gathered(COMM, contact.gap), x[:, -1] + 0.1 * x[:, 0], 1e-12, scale=1.0)
 
 
-# ---- bad input -----------------------------------------------------------------------------------
+# ---- invalid input -------------------------------------------------------------------------------
 
 
-def test_a_tag_that_exists_nowhere():
-    """The message names the tag and those that there are."""
+def test_unknown_tag_is_refused():
+    """The message states the unknown tag and the existing ones."""
     mesh, tags = block_mesh("triangle")
     raised_everywhere(lambda: fc.ContactSurface(mesh, tags, 99), ValueError, "99", "[1, 2, 3, 4]")
     raised_everywhere(lambda: fc.ContactSurface(mesh, tags, [BOTTOM, 99]), ValueError, "99")
 
 
-def test_no_tags_at_all():
-    """An empty list of tags is an empty Γc."""
+def test_empty_list_of_tags_is_refused():
+    """An empty list of tags gives an empty Γc, which is an error."""
     mesh, tags = block_mesh("triangle")
     raised_everywhere(lambda: fc.ContactSurface(mesh, tags, []), ValueError, "empty")
 
@@ -250,7 +250,7 @@ def test_no_tags_at_all():
 @pytest.mark.parametrize("ghost_mode", [GhostMode.none, GhostMode.shared_facet])
 @pytest.mark.parametrize("cell", CELLS)
 def test_interior_facets_are_refused(cell, ghost_mode):
-    """Facets inside the body are no contact surface, wherever in parallel they lie."""
+    """Interior facets of the body raise an error on all ranks, with and without ghost cells."""
     mesh, _ = block_mesh(cell, ghost_mode=ghost_mode)
     d = dimension(cell)
     facets = dolfinx.mesh.locate_entities(mesh, d - 1, lambda x: np.isclose(x[d - 1], 0.5))
@@ -260,7 +260,7 @@ def test_interior_facets_are_refused(cell, ghost_mode):
 
 
 def test_one_interior_facet_on_one_rank_only():
-    """One interior facet among exterior ones, tagged on its owner alone, is found by all ranks."""
+    """One interior facet among exterior ones, tagged on its owner only, raises on all ranks."""
     mesh, tags = block_mesh("quadrilateral", n=(2, 6), ghost_mode=GhostMode.shared_facet)
     inside = dolfinx.mesh.locate_entities(
         mesh, 1, lambda x: np.isclose(x[1], 5 / 6) & (x[0] < 0.5 + 1e-9)
@@ -273,7 +273,7 @@ def test_one_interior_facet_on_one_rank_only():
 
 
 def test_wrong_surface_arguments():
-    """Cell tags, an unknown scheme and a degree below one are named in the message."""
+    """Errors for cell tags, an unknown scheme and a degree below one name the argument."""
     mesh, tags = block_mesh("triangle")
     n_cells = mesh.topology.index_map(2).size_local
     cells = np.arange(n_cells, dtype=np.int32)
@@ -288,8 +288,8 @@ def test_wrong_surface_arguments():
     )
 
 
-def test_a_shell_is_no_body():
-    """A surface mesh in space has no contact with its edges."""
+def test_surface_mesh_in_3d_is_refused():
+    """Contact of the edges of a surface mesh in 3D is not supported."""
     mesh, _ = block_mesh("tetrahedron")
     mesh.topology.create_connectivity(2, 3)
     facets = dolfinx.mesh.exterior_facet_indices(mesh.topology)
@@ -301,7 +301,7 @@ def test_a_shell_is_no_body():
 
 
 def test_prisms_are_refused_by_name():
-    """Their facets are of two kinds, which DOLFINx gives no tags: no word of tags or arrays."""
+    """Prisms have facets of two types, which DOLFINx cannot tag: the error names the cell type."""
     unit = (np.zeros(3), np.ones(3))
     mesh = dolfinx.mesh.create_box(COMM, unit, (1, 1, 1), dolfinx.mesh.CellType.prism)
     none = np.zeros(0, dtype=np.int32)
@@ -312,7 +312,7 @@ def test_prisms_are_refused_by_name():
 
 @pytest.mark.parametrize(("cell", "degree"), GRID)
 def test_cells_and_nodes_of_facets(cell, degree):
-    """Facet by facet as DOLFINx finds them; in the order asked for, whatever it is."""
+    """Cells and nodes of facets are those of DOLFINx, in the order of the given facets."""
     mesh, tags = block_mesh(cell, n=3, shuffled=True)
     fdim, space = mesh.topology.dim - 1, displacement_space(mesh, degree)
     facets = fc.ContactSurface(mesh, tags, [BOTTOM, RIGHT]).facets[::-1]

@@ -1,7 +1,7 @@
-"""Bodies that touch all over a curved surface and are meshed apart: gaps of facets are none.
+"""Bodies in full contact on a curved surface with non-matching meshes: ``gap=0``.
 
-Two rings, one in the other, under pressure inside or outside. Reference: Lamé's stress of the one
-ring that both make, at the radius where they touch.
+Two concentric rings have pressure or tension on the inside. Reference: Lamé's radial stress of one
+ring that consists of both, at the radius of the interface.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ TIE = fc.Foundation(fc.RelativeStiffness(10.0), fc.RelativeStiffness(10.0))
 
 
 def ring(n, inside, outside, degree=1):
-    """A quarter of a ring of quadrilaterals, n along it, straight or of second order."""
+    """Return a quarter of a ring, n quadrilaterals along it, straight or of second order."""
 
     def bend(x):
         angle, radius = x[:, 0] * np.pi / 2, inside + (outside - inside) * x[:, 1]
@@ -36,14 +36,14 @@ def ring(n, inside, outside, degree=1):
 
 
 def pressed(n, law, *, side=-1.0, degree=1, **options):
-    """Mean of the pressure between the rings over Lamé's, and its standard deviation over the mean.
+    """Return mean interface pressure relative to Lamé's, and its coefficient of variation.
 
     Args:
         n: Facets of the inner ring, which has Γc, and of the outer one.
-        law: Between them.
+        law: Contact law between the rings.
         side: Traction on the inner surface along its normal.
-        degree: Of the cells and of the displacement.
-        options: Of the contact.
+        degree: Degree of cells and displacement.
+        options: Options of the contact.
     """
     parts = {
         "inner": ring(n[0], INNER, MIDDLE, degree),
@@ -70,11 +70,12 @@ def pressed(n, law, *, side=-1.0, degree=1, **options):
 
 
 @pytest.mark.parametrize("n", [(13, 20), (20, 13)])
-def test_rings_that_touch(n):
-    """With ``gap=0`` the mean is Lamé's to half a per cent; by the gaps of facets to 20 % at best.
+def test_touching_rings_with_and_without_zero_gap(n):
+    """With ``gap=0`` the mean pressure is Lamé's to 0.5 %; otherwise its error exceeds 20 %.
 
-    It scatters by less than 1 % where the coarser ring has Γc, and by 19 % where the finer one has,
-    at facets beyond the corners of the coarser; without ``gap=0`` by 150 % and more.
+    The pressure scatters by less than 1 % with Γc on the coarser ring, and by 19 % (asserted: 20 %)
+    with Γc on the finer one, at its facets near corners of the coarser; without ``gap=0`` by more
+    than 150 %.
     """
     mean, scatter = pressed(n, fc.Frictionless(), gap=0)
     assert mean == pytest.approx(1.0, abs=5e-3)
@@ -84,12 +85,12 @@ def test_rings_that_touch(n):
 
 
 @pytest.mark.parametrize("factor", [1.0, 10.0])
-def test_the_cause_of_the_scatter(factor):
-    """On the finer side the scatter is that of linear displacements on facets.
+def test_pressure_scatter_is_due_to_faceting(factor):
+    """With Γc on the finer ring the scatter is due to linear displacements on straight facets.
 
-    Between its nodes the coarser facet leaves the arc by h²/8R · u_r/R, which k_n makes a pressure:
-    the scatter grows with k_n (2 and 19 %), and falls with h² (to a quarter). With quadratic cells
-    and displacements there is none.
+    Between its nodes the coarser facet deviates from the arc by h²/8R · u_r/R, which times k_n is a
+    pressure error. The scatter is proportional to k_n (2 and 19 %) and h² (each to 10 %). With
+    quadratic cells and displacements it is below 1e-3.
     """
     law = fc.Frictionless(k_n=fc.RelativeStiffness(factor))
     _, scatter = pressed((20, 13), law, gap=0)
@@ -102,8 +103,8 @@ def test_the_cause_of_the_scatter(factor):
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_rings_that_are_tied(side):
-    """A foundation of 10 E/h with ``gap=0`` ties them, pressed and pulled: as one, 0.5 and 1 %."""
+def test_tied_rings_agree_with_one_ring(side):
+    """Pressed or pulled, rings tied by 10 E/h with ``gap=0`` agree to 0.5 %, scatter below 1 %."""
     mean, scatter = pressed((13, 20), TIE, side=side, gap=0)
     assert mean == pytest.approx(1.0, abs=5e-3)
     assert abs(scatter) < 0.01

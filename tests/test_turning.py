@@ -1,4 +1,4 @@
-"""Obstacles turned by a moment: the angle is unknown, the moment about the axis given."""
+"""Obstacles with prescribed moment about an axis, whose angle of rotation is an unknown."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ COMM = MPI.COMM_WORLD
 
 K = 1e3
 RADIUS = 0.8
-# Of the roller: side, up, moment; pressed, dragged, driven on, turned round.
+# Side, up and moment of the roller: pressed, dragged, driven, driven in the opposite direction.
 PATH = [(0.0, -0.1, 0.0), (0.06, -0.1, 0.0), (0.1, -0.1, -8.0), (0.02, -0.1, 2.0)]
 
 
 def increment_angle(contact, axis):
-    """Moment of the contact forces on the body about the axis of the obstacle, as it is now."""
+    """Return the moment of the contact forces on the body about the obstacle's displaced axis."""
     d = len(axis)
     motion = np.array(contact.values.shift[:1].sum(axis=0))
     motion = np.array([COMM.allreduce(float(v), op=MPI.SUM) for v in motion])
@@ -37,12 +37,12 @@ def increment_angle(contact, axis):
 
 
 def moment_of(tool):
-    """The same of a `Tool`."""
+    """Return the moment of the contact forces of a `Tool` about its axis."""
     return increment_angle(tool.contact, tool.vector(0.0, tool.scene.height + RADIUS))
 
 
 def roll(tool, side, up, moment):
-    """One increment of a driven `Tool`."""
+    """Set the moment of a driven `Tool` and solve an increment."""
     tool.moment.value = moment
     return tool.go(side, up)
 
@@ -51,7 +51,7 @@ def roll(tool, side, up, moment):
 
 
 def scene_of(cell, law, shape):
-    """An obstacle that cuts into a block, pressed and turned by forces; all unknowns there are."""
+    """Return a block and an obstacle that penetrates it, with unknown translation and rotation."""
     scene = rubber(cell, 2 if cell == "triangle" else 1, n=(4, 2), shuffled=True)
     d = scene.dim
     side, middle = (0.0,) * (d - 1), (0.0,) * (d - 1) + (scene.height + 0.7,)
@@ -69,10 +69,11 @@ def scene_of(cell, law, shape):
 
 
 def difference(problem, contact, state, way):
-    """Largest error of the tangent times a way, against central differences of forces; shares.
+    """Compare the tangent times a direction with central differences of the forces.
 
     Returns:
-        Of all rows, and of those of the obstacle's unknowns, relative to the largest of each.
+        Largest errors in all rows, and in the rows of the obstacle's unknowns, each relative to
+        the largest entry of these rows.
     """
     operator, unknowns, step = problem.full.operators[0], problem.full.unknowns, 1e-6
 
@@ -97,8 +98,8 @@ def difference(problem, contact, state, way):
 @pytest.mark.parametrize(
     ("cell", "shape"), [("triangle", "plane"), ("triangle", "ball"), ("tetrahedron", "cylinder")]
 )
-def test_derivatives(cell, shape):
-    """The column of the angle, its row, and both with all others, over a history: 1e-6.
+def test_tangent_matches_central_differences(cell, shape):
+    """Column and row of the angle, alone and with all other unknowns, over a history: 1e-6.
 
     Central differences of 1e-6 in a state of size 1 have an error of 1e-9. Open, sticking and
     slipping points occur. The matrix without friction is symmetric, to round-off.
@@ -138,10 +139,11 @@ def test_derivatives(cell, shape):
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
-def test_a_platen_pressed_eccentrically(cell):
-    """It tilts until the contact forces have the moment: 1e-9 of force times width.
+def test_eccentrically_loaded_platen_tilts(cell):
+    """The platen tilts until the contact forces have the moment, to 1e-9 of force times width.
 
-    The same force to the other side tilts it the other way, 1e-7; in the middle not at all.
+    The opposite moment tilts it in the opposite direction, to 1e-7; without moment it does not
+    tilt.
     """
     scene = rubber(cell, 1, n=(8, 4) if cell == "quadrilateral" else (4, 2))
     d, top = scene.dim, scene.height
@@ -158,21 +160,22 @@ def test_a_platen_pressed_eccentrically(cell):
         assert contact.resultants().force[-1] == pytest.approx(-40.0, rel=1e-9)
         assert abs(increment_angle(contact, about) - value) < 1e-9 * 40.0 * 2.0
         angles.append(float(contact.free_angle.value))
-    # A force down has the moment of one to the left of the middle.
+    # A positive moment is that of a downward force left of the middle.
     assert abs(angles[0]) < 1e-12
     assert angles[1] > 1e-3
     assert angles[2] == pytest.approx(-angles[1], rel=1e-7)
 
 
 @pytest.mark.parametrize(("cell", "force"), [("triangle", True), ("hexahedron", False)])
-def test_a_free_roller_rolls(cell, force):
-    """Moment 0, dragged by 0.2, an eighth of its diameter, and back: it rolls on friction.
+def test_roller_without_moment_rolls(cell, force):
+    """A roller with moment 0, dragged by 0.2, an eighth of its diameter, and back, rolls.
 
-    No friction is left about the axis, 1e-9 of the force; the force aside is below 2 % of what
-    sliding takes. It turns by side/R, 5 %: the surface it rolls on is stretched, and it sinks in.
+    Friction has no moment about the axis, to 1e-9 of the force; the horizontal force is below 2 %
+    of that of sliding. The angle is side/R, to 5 %: the surface under it is stretched, and it sinks
+    in.
     """
     tool = Tool(cell, driven=True, force=force, **({"n": (16, 6)} if cell == "triangle" else {}))
-    sign = -1.0 if cell == "triangle" else 1.0  # in space about y, and to the right is along it
+    sign = -1.0 if cell == "triangle" else 1.0  # in space the axis is y: positive to the right
     tool.down.value = -60.0
     tool.go(0.0, -0.1)
     for side in (0.05, 0.2, 0.1, 0.0):
@@ -180,18 +183,18 @@ def test_a_free_roller_rolls(cell, force):
         tool.go(side, -0.1)
         angle, normal = float(tool.contact.free_angle.value), -tool.resultant()[-1]
         assert abs(moment_of(tool)) < 1e-9 * normal
-        if cell == "triangle":  # or else facets are few, and their edges hold it
+        if cell == "triangle":  # otherwise there are few facets, whose edges resist rolling
             assert abs(tool.resultant()[0]) < 0.02 * 0.3 * normal
             assert angle == pytest.approx(sign * side / RADIUS, rel=0.05, abs=2e-3)
         else:
             assert angle == pytest.approx(sign * side / RADIUS, rel=0.25, abs=5e-3)
 
 
-def test_long_increments_roll_less():
-    """Dragged by half of its radius at once, a roller turns by less than in eight increments.
+def test_long_increments_reduce_the_rolling_angle():
+    """Dragged by half its radius in one increment, a roller turns by less than in eight increments.
 
-    By geometry between atan(s/R), as the first point that it comes to is seen, and s/R; 3 % for the
-    stretch of what it rolls on.
+    By geometry the angle is between atan(s/R), because slip starts at the first contact of a point,
+    and s/R; 3 % for the stretch of the surface under it.
     """
     turned = []
     for n in (1, 8):
@@ -205,10 +208,10 @@ def test_long_increments_roll_less():
     assert turned[1] == pytest.approx(0.5, rel=0.03)
 
 
-def test_a_driven_roller_pulls():
-    """A roller that is held where it is, driven by M: it pulls by M/R, 5 % for what it sinks in.
+def test_driven_roller_exerts_traction():
+    """A roller at a fixed position, driven by M, exerts a force of M/R, to 5 % because it sinks in.
 
-    More than μ N R it cannot: then there is no solution, and the state is as before.
+    The force cannot exceed μ N: then there is no solution, and the state is as before.
     """
     tool = Tool(driven=True, n=(16, 6))
     roll(tool, 0.0, -0.1, 0.0)
@@ -227,10 +230,10 @@ def test_a_driven_roller_pulls():
     ("cell", "enforcement"),
     [("triangle", "penalty"), ("triangle", "augmented"), ("tetrahedron", "augmented")],
 )
-def test_given_moment_and_given_angle_are_two_ways_to_one_state(cell, enforcement):
-    """Drive by moments; then prescribe the angles that were found, by the tangent of old.
+def test_prescribed_moment_and_prescribed_angle_agree(cell, enforcement):
+    """Moments are prescribed first; then the computed angles, with the tangent for known angles.
 
-    Tractions to 1e-7 of the largest, that of the balance of moments; energies likewise.
+    Tractions agree to 1e-7 of the largest, the tolerance of the moments; work to 1e-6.
     """
     contact = {"enforcement": enforcement, "tolerance": 1e-9}
     options = {"contact": contact, "law": fc.Coulomb(0.2, 1e4, 1e4)}
@@ -248,11 +251,11 @@ def test_given_moment_and_given_angle_are_two_ways_to_one_state(cell, enforcemen
     assert seen[1] > 0 or cell == "tetrahedron"  # few points, which all stick
 
 
-def test_turning_the_whole_scene_only_turns_the_answer():
-    """Pressed and rolled, then all turned by 1.2 rad about the origin, then rolled on.
+def test_rotation_of_the_whole_scene_rotates_the_solution():
+    """A roller rolls before and after a rotation of the whole scene by 1.2 rad about the origin.
 
-    Tractions are those of the scene that was not turned, turned, and the angle found is larger by
-    as much: 1e-9.
+    Tractions are those of the scene that is not rotated, rotated, and the computed angle is larger
+    by the angle of the rotation: 1e-9.
     """
     still, tool = (Tool(driven=True) for _ in range(2))
     for side, up, moment in PATH[:3]:
@@ -277,7 +280,7 @@ def test_turning_the_whole_scene_only_turns_the_answer():
 
 
 def test_work_of_the_moment():
-    """A drum driven to and fro in small increments: what the moment does is the work, 2 %."""
+    """A drum is driven in small increments: the work in the energies is the moment's, to 2 %."""
     tool = Tool(driven=True, n=(12, 6))
     roll(tool, 0.0, -0.1, 0.0)
     work, moment, angle = 0.0, 0.0, float(tool.contact.free_angle.value)
@@ -289,18 +292,19 @@ def test_work_of_the_moment():
 
 
 @pytest.mark.parametrize("options", [{"solver": {"method": "lbfgs"}}, {"mixed": "Taylor-Hood"}])
-def test_other_methods_and_bodies(options):
-    """L-BFGS, and a body with a pressure as second unknown: the moment is the one given, 1e-9."""
+def test_moment_is_reached_by_lbfgs_and_mixed_elements(options):
+    """With L-BFGS, and with the pressure as an unknown, the moment is as prescribed, to 1e-9."""
     tool = Tool(driven=True, n=(8, 4), **options)
     for side, up, moment in PATH:
         roll(tool, side, up, moment)
         assert moment_of(tool) == pytest.approx(moment, rel=1e-9, abs=1e-8)
 
 
-def test_two_rollers():
-    """Below a strip, pressed by a force, and above it: driven against each other, each has its own.
+def test_two_rollers_have_their_own_moments():
+    """Rollers below a strip, pressed by a force, and above it are driven against each other.
 
-    Moments 1e-9 of force times radius; the scene is its own image, and so are the angles: 1e-9.
+    Moments agree to 1e-9 of force times radius; the scene is symmetric, and so are the angles:
+    1e-9.
     """
     scene = block("quadrilateral", 1, n=6)
     force, *moments = (fem.Constant(scene.mesh, 0.0) for _ in range(3))
@@ -330,8 +334,8 @@ def test_two_rollers():
 # ---- systems, files, input -----------------------------------------------------------------------
 
 
-def test_condensed_and_not():
-    """A linear body, condensed onto what contact touches and the angle: the same, 1e-8."""
+def test_condensed_and_full_systems_agree():
+    """Static condensation of a linear body onto contact dofs and angle changes nothing, to 1e-8."""
     found = []
     for condensation in (True, False):
         solver = {"small_displacement_tolerance": np.inf, "condensation": condensation}
@@ -357,14 +361,14 @@ HOW = {
 
 
 @pytest.mark.parametrize("how", HOW)
-def test_going_on_from_a_file(how, tmp_path):
-    """Broken off on the way, and taken up: the same digits on one rank, 1e-7 on more."""
+def test_restart_from_a_checkpoint(how, tmp_path):
+    """A history that is interrupted and restarted has the same digits on one rank, 1e-7 on more."""
     folder = shared_folder(tmp_path)
     goes_on(lambda: Tool(driven=True, n=(8, 4), **HOW[how]), folder, stop=5)
 
 
-def test_a_file_of_another_axis_or_moment_is_refused(tmp_path):
-    """Even where nothing has turned yet: with the axis elsewhere, or prescribed."""
+def test_checkpoint_of_another_axis_or_moment_is_refused(tmp_path):
+    """Restart with another axis, or a prescribed angle, is refused even before any rotation."""
     path = shared_folder(tmp_path) / "state.npz"
 
     def make(about=(0.0, 1.8), angle=None, moment=None):
@@ -388,8 +392,8 @@ def test_a_file_of_another_axis_or_moment_is_refused(tmp_path):
             raised_everywhere(lambda p=again: checkpoint.load(p, path), ValueError, word)
 
 
-def test_a_file_of_another_direction_of_the_axis_is_refused(tmp_path):
-    """In space, where nothing has turned yet."""
+def test_checkpoint_of_another_axis_direction_is_refused(tmp_path):
+    """In space, restart with another direction of the axis is refused even before any rotation."""
     path = shared_folder(tmp_path) / "state.npz"
     problems = []
     for axis in ((0, 1, 0), (0, 2, 0), (0, 1, 0.1)):
@@ -402,11 +406,11 @@ def test_a_file_of_another_direction_of_the_axis_is_refused(tmp_path):
     raised_everywhere(lambda: checkpoint.load(problems[2], path), ValueError, "axis")
 
 
-def test_increments_are_cut_until_it_spins():
-    """Driven by more than friction bears, in one increment that is cut: it ends below the limit.
+def test_increments_are_cut_up_to_the_friction_limit():
+    """A moment above the friction limit, in one increment that is cut, is reached up to the limit.
 
-    The limit is μ p at the radius that it has where it sinks in; within 5 % of it there is no next
-    increment that is not cut too often. The last state has its moment, 1e-9.
+    The limit is μ p times the radius reduced by the penetration; within 5 % of it there is no next
+    increment that is not cut too often. The last state has its moment, to 1e-9.
     """
     tool = Tool(driven=True, n=(8, 3), degree=1)
     roll(tool, 0.0, -0.1, 0.0)
@@ -425,8 +429,8 @@ def test_increments_are_cut_until_it_spins():
     assert moment_of(tool) == pytest.approx(reached[-1], rel=1e-9)
 
 
-def test_a_turn_of_more_than_a_right_angle_is_no_trial():
-    """A residual there is no number, so that a line search takes a shorter step."""
+def test_rotation_by_more_than_a_right_angle_is_no_trial_state():
+    """The residual of such a state is NaN, so that a line search takes a shorter step."""
     tool = Tool(driven=True, n=(4, 2))
     roll(tool, 0.0, -0.05, 0.0)
     system, unknowns = tool.problem.full, tool.problem.full.unknowns
@@ -437,8 +441,8 @@ def test_a_turn_of_more_than_a_right_angle_is_no_trial():
         assert system.is_over_rotated() == twisted
 
 
-def test_nothing_holds_a_smooth_roller():
-    """Without friction no force on a disc has a moment about its middle."""
+def test_frictionless_roller_is_unconstrained():
+    """Without friction no contact force on a disc has a moment about its centre."""
     scene = rubber(n=(4, 2))
     obstacle = disc(scene, RADIUS, displacement=(0, -0.1), moment=0.0)
     raised_everywhere(
@@ -467,8 +471,8 @@ FLAT = {"point": (0, 1), "normal": (0, -1)}
         ),
     ],
 )
-def test_refused(rotation, options, error, text):
-    """Before any work, on all ranks, with what to give instead."""
+def test_invalid_rotations_are_refused(rotation, options, error, text):
+    """Invalid rotations are refused before any work, on all ranks; the error states the remedy."""
     scene = rubber("triangle", 1, n=(2, 1))
     raised_everywhere(
         lambda: scene.contact(
@@ -479,8 +483,8 @@ def test_refused(rotation, options, error, text):
     )
 
 
-def test_a_moment_given_by_a_number_can_be_set():
-    """It is a parameter of the contact, as an angle is."""
+def test_moment_given_as_a_number_can_be_changed():
+    """A moment is a parameter of the contact, as an angle is."""
     scene = rubber("triangle", 1, n=(2, 1))
     contact = scene.contact(disc(scene, RADIUS, moment=0.5), fc.Coulomb(0.3, K, K))
     assert contact.applied_moment is contact.parameters["moment"]
@@ -489,8 +493,8 @@ def test_a_moment_given_by_a_number_can_be_set():
     assert contact.motions[0].force * contact.motions[0].length == -2.0
 
 
-def test_a_moment_that_is_no_number():
-    """NaN in a constant: no load."""
+def test_moment_that_is_nan_is_refused():
+    """NaN in the constant of the moment is refused; the state stays zero."""
     tool = Tool(driven=True, n=(4, 2))
     tool.moment.value = np.nan
     raised_everywhere(tool.problem.solve, ValueError, "not finite")

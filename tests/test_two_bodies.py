@@ -1,4 +1,4 @@
-"""Two deformable bodies in one mesh: pairs, patch tests, action and reaction, a shrink fit."""
+"""Two deformable bodies in one mesh: pairs, patch tests, equilibrium of forces, shrink fit."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ pytestmark = [
 @pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("cell", CELLS)
 def test_patch(cell: str, degree: int, nu: float) -> None:
-    """Non-matching meshes carry a uniform pressure exactly, and the interface jumps by p/k_n.
+    """Non-matching meshes transmit a uniform pressure exactly, with the gap -p/k_n.
 
-    Reference: p = 0.01 / (1/M + 1/k_n), M the confined modulus of height 1. To 1e-9: the solver's
-    tolerance.
+    Reference: p = 0.01 / (1/M + 1/k_n), M the confined modulus, height 1; to 1e-9, the tolerance
+    of the solver.
     """
     k_n = 1e7
     problem, contact, _ = pressed(cell, degree, nu, fc.Coulomb(0.3, k_n=k_n, k_t=1e6))
@@ -51,19 +51,19 @@ def test_patch(cell: str, degree: int, nu: float) -> None:
 
 
 def test_exact_contact_pressure() -> None:
-    """E = 1e6, ν = 0, the top moved by 0.01: p → 1e4 with the stiffness; free sides."""
+    """For E = 1e6, ν = 0, free sides and a compression of 0.01, p tends to 1e4 as k_n grows."""
     problem, contact, _ = pressed(
         "quadrilateral", 1, 0.0, fc.Frictionless(k_n=1e12), confined=False, method="newton"
     )
     problem.solve()
-    # p/k_n = 1e-8 of the 0.01 m: the jump takes 1e-6 of the pressure.
+    # The gap p/k_n = 1e-8, 1e-6 of the compression, reduces the pressure by 1e-6.
     assert contact.gather()["pressure"] == pytest.approx(1e4, rel=2e-6)
 
 
 @pytest.mark.parametrize("surface", [LOWER, UPPER])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_forces_and_moments_cancel(cell: str, surface: int) -> None:
-    """Contact forces of a rough state: sum zero to round-off, moment zero as the gap is zero."""
+def test_contact_forces_and_moments_sum_to_zero(cell: str, surface: int) -> None:
+    """Contact forces of an oscillating u sum to zero, as do moments at zero gap, to 1e-12."""
     problem, contact, _ = pressed(cell, 1, 0.3, fc.Coulomb(0.3, k_n=1e6, k_t=1e6), surface=surface)
     u, d = problem.u, len(problem.u)
     u.interpolate(
@@ -87,10 +87,10 @@ def test_forces_and_moments_cancel(cell: str, surface: int) -> None:
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_tangent_is_the_derivative_of_the_force(cell: str) -> None:
-    """Central differences, 1e-6, away from kinks: all points closed and slipping."""
+    """The tangent agrees with central differences to 1e-6 if all points are closed and slip."""
     problem, contact, _ = pressed(cell, 1, 0.3, fc.Coulomb(0.1, k_n=1e6, k_t=1e6))
     u, d = problem.u, len(problem.u)
-    # The lower block moved up into the upper one, and along it: closed and slipping everywhere.
+    # Moving the lower block up and sideways closes all points and makes them slip.
     mesh = u.function_space.mesh
     upper = fem.Function(fem.functionspace(mesh, ("DG", 0)))
     mids = upper.function_space.tabulate_dof_coordinates()[:, d - 1]
@@ -120,26 +120,26 @@ def test_tangent_is_the_derivative_of_the_force(cell: str) -> None:
     assert size > 0 and difference.norm() <= 1e-6 * size
 
 
-def test_points_that_look_past_the_other_body() -> None:
-    """A wider lower block: points beyond the upper one are open, and counted."""
+def test_points_beyond_the_opposing_body_are_open() -> None:
+    """Points of a wider lower block beyond the upper one are open and counted as unpaired."""
     mesh, tags = two_blocks("quadrilateral", (8, 3), widths=(2.0, 1.0))
     V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
     u = fem.Function(V)
     surface = fc.ContactSurface(mesh, tags, LOWER)
     contact = fc.Contact(u, surface, fc.DeformableBody(tags, UPPER), fc.Frictionless(k_n=1e6))
-    # Eight facets of 1/4 with two points each: four look past the block of width 1.
+    # Of eight facets of 1/4 with two points each, four are beyond the block of width 1.
     assert contact.n_unpaired == 8
     x = contact.gather()["x"][:, 0]
     status = contact.gather()["status"]
     assert np.all(status[x > 1.0] == fc.Status.OPEN)
 
 
-def test_reach() -> None:
-    """Opposites farther than ``search_distance`` are none."""
+def test_search_distance_limits_pairs() -> None:
+    """Points farther apart than ``search_distance`` are not paired."""
     mesh, tags = two_blocks("quadrilateral", (4, 3))
     u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (2,))))
     surface = fc.ContactSurface(mesh, tags, BOTTOM)
-    # From the bottom outwards nothing is met within 0.1; the rays of LOWER meet UPPER at once.
+    # Rays from the bottom outwards hit nothing within 0.1; rays from LOWER hit UPPER at once.
     far = fc.Contact(
         u, surface, fc.DeformableBody(tags, TOP, search_distance=0.1), fc.Frictionless(1e6)
     )
@@ -148,15 +148,15 @@ def test_reach() -> None:
         fc.DeformableBody(tags, TOP, search_distance=-1.0)
 
 
-def test_form_alone_says_what_it_lacks() -> None:
-    """The boundary form cannot reach the opposite body's unknowns, and says so."""
+def test_boundary_form_with_opposing_body_raises() -> None:
+    """The boundary form has no dofs of the opposing body, so `Contact.form` raises."""
     problem, contact, _ = pressed("triangle", 1, 0.0, fc.Frictionless(k_n=1e6))
     with pytest.raises(ValueError, match="opposing body"):
         contact.form(ufl.TestFunction(problem.u.function_space))
 
 
 def rings(h: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """Quarters of two rings, 10/20 and 20/40, curved cells, meshes that do not match."""
+    """Quarters of two rings, radii 10/20 and 20/40, with curved cells and non-matching meshes."""
     gmsh.initialize()
     try:
         gmsh.option.setNumber("General.Terminal", 0)
@@ -198,7 +198,7 @@ def rings(h: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
 
 
 def test_shrink_fit() -> None:
-    """Lamé: radii 10/20/40, interference 0.02, plane strain: p = 69.231 within 0.5 %."""
+    """Lamé, radii 10/20/40, interference 0.02, plane strain: mean p = 69.231 within 0.5 %."""
     mesh, tags = rings(2.0)
     V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
     u, v = fem.Function(V), ufl.TestFunction(V)
@@ -217,24 +217,24 @@ def test_shrink_fit() -> None:
         gap=-0.02,
     )
     problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
-    assert problem.initial_penetration == 0.0  # an interference by intent is no accident
+    assert problem.initial_penetration == 0.0  # a prescribed interference does not count
     problem.solve()
     points = contact.gather()
     mean = points["pressure"] @ points["measure"] / points["measure"].sum()
     assert mean == pytest.approx(69.231, rel=0.005)
-    # Quadratic cells of a tenth of the radius: the pressure is uniform to 1 %.
+    # With quadratic cells of a tenth of the radius the pressure is uniform to 1 %.
     assert points["pressure"] == pytest.approx(np.full(len(points["x"]), mean), rel=0.01)
     assert contact.n_unpaired == 0
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("fine", [10, 40])
-def test_a_coarse_surface_presses_on_all_of_a_fine_one(kinematics, fine) -> None:
-    """Facets 10 and 40 times as long as the opposite ones have points for each of these.
+def test_coarse_slave_surface_on_fine_master_surface(kinematics, fine) -> None:
+    """Facets 10 and 40 times as long as the opposing ones have points for each of these.
 
-    Reference: the force with Γc on the fine block, another discretisation of the same scene, to
-    12 %, what four coarse cells leave between the two; by two points a facet, which pierce the fine
-    block, it is 40 to 50 % less.
+    Reference: the force with Γc on the fine block, another discretisation of the same problem, to
+    12 %, the difference due to four coarse cells. With two points per facet the fine block
+    penetrates between them and the force is 40 to 50 % less.
     """
     forces = []
     for own, other in ((LOWER, UPPER), (UPPER, LOWER)):
@@ -257,9 +257,9 @@ def test_a_coarse_surface_presses_on_all_of_a_fine_one(kinematics, fine) -> None
 
 
 def _on_a_graded_plate(own, wide, *, space=False, kinematics="finite"):
-    """A block on a plate that has 20 facets in its first 1/2, and then facets as wide as that.
+    """A block on a plate that has 20 facets in its first 1/2, and then facets of length 1/2.
 
-    It has one facet as wide, or is as long as the plate (``wide``); in space there are 8.
+    The block has one facet of 1/2, or is as long as the plate (``wide``); 8 facets in 3D, not 20.
     """
     fine, end = (8, 6.0) if space else (20, 20.0)
     across = [np.linspace(0.0, 0.5, fine + 1)] if space else []
@@ -290,11 +290,11 @@ def _on_a_graded_plate(own, wide, *, space=False, kinematics="finite"):
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-def test_a_surface_on_the_fine_end_of_a_graded_one(kinematics) -> None:
-    """A facet has points for the 20 that are under it, however many others are as long as it is.
+def test_small_block_on_fine_end_of_graded_plate(kinematics) -> None:
+    """A facet has points for the 20 facets under it, although most others are as long as it is.
 
-    Reference: the force with Γc on the plate, to 1 %; by two points, as of facets alike, 2 and 17 %
-    of it were missing.
+    Reference: the force with Γc on the plate, to 1 %. With two points, as for facets of equal
+    length, 2 and 17 % of it were missing.
     """
     forces = []
     for own in (UPPER, LOWER):
@@ -304,8 +304,8 @@ def test_a_surface_on_the_fine_end_of_a_graded_one(kinematics) -> None:
     assert forces[0] == pytest.approx(forces[1], rel=0.01)
 
 
-def test_the_fine_end_under_a_long_surface_is_told_of_in_space() -> None:
-    """A twelfth of Γc is on facets 6 times as short by their longest sides, or 8 by one of them."""
+def test_warning_for_fine_end_under_long_surface_in_3d() -> None:
+    """A twelfth of Γc is on facets 6 times shorter in their longest sides, 8 times in one side."""
     for own, expected in ((UPPER, ["6 times"]), (LOWER, [])):
         _, contact, texts = _on_a_graded_plate(own, wide=True, space=True)
         assert contact.quadrature.degree == (6 if expected else 2)
@@ -313,11 +313,10 @@ def test_the_fine_end_under_a_long_surface_is_told_of_in_space() -> None:
         assert all(times in text for times, text in zip(expected, texts, strict=True))
 
 
-def test_a_surface_that_slides_onto_finer_facets_is_refused() -> None:
-    """Where it comes to lie on 20 facets, which pass between its points, not on one as long.
+def test_sliding_onto_finer_facets_fails_without_enough_points() -> None:
+    """The solve fails on 20 facets, which penetrate between the points, not on one as long.
 
-    Without the verdict more than 15 % of the force by as many points as these facets take was
-    missing there.
+    Unverified, the force was more than 15 % below that with the points that 20 facets need.
     """
     for given in (None, 78):
         x = np.r_[np.linspace(0.0, 0.5, 21), np.arange(1.0, 20.1, 0.5)]
@@ -345,8 +344,8 @@ def test_a_surface_that_slides_onto_finer_facets_is_refused() -> None:
 
 
 @pytest.mark.parametrize("cell", CELLS)
-def test_points_are_as_many_as_the_opposite_facets_take(cell) -> None:
-    """P + 1 on each side for every opposite facet, 10 here; a degree that is given is kept."""
+def test_quadrature_degree_follows_opposing_facets(cell) -> None:
+    """Each side has p + 1 points per opposing facet, 10 here; a given degree is not changed."""
     mesh, tags = two_blocks(cell, (1, 10))
     d, law = mesh.geometry.dim, fc.Frictionless(k_n=E)
     u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (d,))))
@@ -355,11 +354,11 @@ def test_points_are_as_many_as_the_opposite_facets_take(cell) -> None:
         surface = fc.ContactSurface(mesh, tags, own, quadrature_degree=given)
         contact = fc.Contact(u, surface, fc.DeformableBody(tags, other), law)
         degrees.append(contact.quadrature.degree)
-    assert degrees == [{2: 38, 3: 6}[d], 2, 3]  # 2n - 2 has n points a side; 6 is the limit
+    assert degrees == [{2: 38, 3: 6}[d], 2, 3]  # 2n - 2: n points a side; limit 6 in 3D
 
 
 def _pressed_by(cell, times, *, degree=1, own=LOWER, kinematics="finite", given=None, **options):
-    """A block of one cell under one of ``times`` along each side, moved down on it by a tenth."""
+    """A block of ``times`` cells per side, moved down by a tenth of its height onto one cell."""
     mesh, tags = two_blocks(cell, (1, times))
     d = mesh.geometry.dim
     u = fem.Function(fem.functionspace(mesh, ("Lagrange", degree, (d,))))
@@ -381,12 +380,12 @@ def _pressed_by(cell, times, *, degree=1, own=LOWER, kinematics="finite", given=
 @pytest.mark.parametrize(
     ("cell", "degree", "times"), [("hexahedron", 1, 6), ("tetrahedron", 1, 6), ("hexahedron", 2, 3)]
 )
-def test_a_surface_too_coarse_for_its_points_is_warned_of(cell, degree, times, caplog) -> None:
-    """Once, in the log of the first rank and on all, with a degree that helps; so does swapping.
+def test_warning_if_quadrature_is_too_coarse(cell, degree, times, caplog) -> None:
+    """One warning, on all ranks and in the log of the first, names a sufficient degree.
 
     Reference: the force with Γc on the fine block. By default 22 % of it are missing on quadratic
-    hexahedra, more than 2 %; linear cells are refused: edges of the fine block enter Γc.
-    With the degree that is told 0.4 % at most are missing, less than 1 %.
+    hexahedra (asserted: 2 %); linear cells fail, since edges of the fine block enter Γc.
+    With the degree of the warning at most 0.4 % are missing (asserted: 1 %).
     """
     problem, contact, texts = _pressed_by(cell, times, degree=degree)
     wanted = times * (2 * degree + 2) - 2
@@ -413,11 +412,11 @@ def test_a_surface_too_coarse_for_its_points_is_warned_of(cell, degree, times, c
 @pytest.mark.parametrize(
     ("cell", "n", "width"), [("quadrilateral", 4, 0.6), ("hexahedron", 2, 0.3)]
 )
-def test_facets_over_which_the_opposite_ends_are_warned_of(cell, n, width) -> None:
-    """Once, where Γc is on the slab; not with points enough, nor with Γc on the smaller block.
+def test_warning_if_opposing_surface_ends_within_facets(cell, n, width) -> None:
+    """One warning with Γc on the slab; none with enough points, or Γc on the smaller block.
 
-    Reference: the force with Γc on the block, of which 8 and 13 % are missing; 1 % with points
-    enough, as Γc is another side.
+    Reference: the force with Γc on the block, of which 8 and 13 % are missing (asserted: 7 %);
+    with enough points it differs by 1 % (asserted: 2 %), since Γc is the other surface.
     """
     forces, told = [], []
     for own, other, degree in ((LOWER, UPPER, None), (LOWER, UPPER, 30), (UPPER, LOWER, None)):
@@ -454,11 +453,11 @@ def test_facets_over_which_the_opposite_ends_are_warned_of(cell, n, width) -> No
         ((1, 8), (1, 8), False),
     ],
 )
-def test_long_and_narrow_facets_are_counted_across(here, there, told) -> None:
-    """By their longest sides all are as long; the surfaces are cut into (along x, along y) facets.
+def test_narrow_facets_are_counted_along_both_sides(here, there, told) -> None:
+    """All facets have equal longest sides; the surfaces have (along x, along y) facets.
 
-    Reference: the force with 9 points a side, of degree 16, to 1 %. By two points a side, as facets
-    alike have, 5.7, 7 and 5 % of it were missing, of which nothing told.
+    Reference: the force with 9 points per side (degree 16), to 1 %. With two points per side, as
+    for equal facets, 5.7, 7 and 5 % of it were missing without a warning.
     """
     forces = []
     for given in (None, 16):
@@ -505,20 +504,20 @@ def test_long_and_narrow_facets_are_counted_across(here, there, told) -> None:
         ("small", "multigrid", "lbfgs"),
     ],
 )
-def test_method_of_linear_bodies_by_default(kinematics, solver, method) -> None:
-    """Newton's where pairs follow and a tangent is factored; else L-BFGS takes one tangent."""
+def test_default_method_for_linear_bodies(kinematics, solver, method) -> None:
+    """Newton's method for finite kinematics and a direct solver, else L-BFGS (one tangent)."""
     options = {"kinematics": kinematics, "linear_solver": solver, "condensation": False}
     problem, _, _ = _pressed_by("hexahedron", 2, **options)
     assert problem.solve().attempts[0].method == method
 
 
-def test_a_linear_block_is_dragged_over_a_slab() -> None:
-    """Over 6 facets, springs of 10 E/h, by the package's own choice and without cuts.
+def test_dragged_block_with_default_method_needs_no_cuts() -> None:
+    """The slip distance is 6 facets, the stiffness 10 E/h; the method is the default one.
 
-    References: 124 iterations in 20 increments, less than 150. Newton's method to its own end took
-    117 to 206, for one increment in which it wanders from partner to partner by round-off, and so
-    by ranks; L-BFGS takes 793 and gives up at the tenth. The imbalance of energies, of partners
-    that change, is 0.65 of that in 10 increments, less than 0.8.
+    References: 124 iterations in 20 increments, less than 150. Newton's method without fallback
+    took 117 to 206, because round-off, and so the number of ranks, decides between pairs in one
+    increment; L-BFGS takes 793 and fails in the tenth. The energy imbalance, due to changes of
+    pairs, is 0.65 of that in 10 increments, less than 0.8.
     """
     imbalances = []
     for steps in (10, 20):
@@ -530,8 +529,8 @@ def test_a_linear_block_is_dragged_over_a_slab() -> None:
     assert imbalances[1] < 0.8 * imbalances[0]
 
 
-def test_no_warning_of_a_coarse_surface_where_little_is_missing() -> None:
-    """Less than 1 % is, as measured; whoever gives a degree has chosen it; all may touch all."""
+def test_no_warning_if_quadrature_error_is_small() -> None:
+    """No warning below 1 % (measured), for a given degree, or with both surfaces in Γc."""
     for cell, times, options in (
         ("hexahedron", 5, {}),
         ("tetrahedron", 5, {}),
@@ -548,8 +547,8 @@ def test_no_warning_of_a_coarse_surface_where_little_is_missing() -> None:
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 @pytest.mark.parametrize("contrast", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("swap", [False, True])
-def test_scaled_stiffness_is_by_the_softer_body(cell, contrast, swap) -> None:
-    """k_n = factor E/h with the smaller E, whichever body has Γc, and h of Γc: here 1/3 and 1/4.
+def test_relative_stiffness_uses_the_softer_body(cell, contrast, swap) -> None:
+    """k_n = factor E/h with the smaller E of both bodies, and h of Γc: 1/2 and 1/4 here.
 
     Tolerance 1e-6: E is measured in the bulk form, and smoothed by an iterative solve.
     """
@@ -570,8 +569,8 @@ def test_scaled_stiffness_is_by_the_softer_body(cell, contrast, swap) -> None:
     assert stiffness == pytest.approx(np.full(len(stiffness), wanted), rel=1e-6)
 
 
-def test_bodies_are_told_apart() -> None:
-    """A body that nothing holds is named, where the other is held."""
+def test_unconstrained_body_is_named() -> None:
+    """The error names the body without Dirichlet conditions; the other one is clamped."""
     mesh, tags = two_blocks("triangle", (3, 4))
     V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
     u, v = fem.Function(V), ufl.TestFunction(V)
@@ -583,8 +582,8 @@ def test_bodies_are_told_apart() -> None:
         fc.ContactProblem(residual(u, v, E, 0.0), u, bcs=[clamp], contacts=[contact])
 
 
-def test_matrix_reproduces_rigid_motions() -> None:
-    """The jump of a rigid motion of both bodies is zero at every point, to round-off."""
+def test_jump_of_a_rigid_body_motion_is_zero() -> None:
+    """The jump of one rigid-body motion of both bodies is zero at every point, to 1e-12."""
     _, contact, _ = pressed("tetrahedron", 1, 0.3, fc.Frictionless(k_n=1e6), n=(3, 5))
     space = contact.u.function_space
     motion = fem.Function(space)

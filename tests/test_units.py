@@ -1,4 +1,4 @@
-"""Units do not matter: the same scene in others takes the same effort, by every method."""
+"""Iterations and solutions of every method are independent of units."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
 
 METHODS = (None, "lbfgs", "newton", "continuation", "alternating")
-# Factors of lengths and of stresses: N-mm, SI, and two without round numbers, whose products have
-# other round-off in every digit.
+# Factors of lengths and of stresses: N-mm, SI, and two that are not powers of ten, whose products
+# have other round-off.
 UNITS = [(1.0, 1.0), (1e-3, 1e6), (0.7, 3.3)]
 CONDENSATION = [None, False]
 
 
 def same(results) -> None:
-    """As many iterations, fields to 1e-9: the round-off of other numbers in some iterations."""
+    """Check that iterations differ by at most one per increment, and fields by 1e-9 (round-off)."""
     for iterations, *fields in results[1:]:
         assert same_effort(iterations, results[0][0])
         for field, first in zip(fields, results[0][1:], strict=True):
@@ -38,15 +38,15 @@ def same(results) -> None:
 @pytest.mark.parametrize(
     ("cell", "degree", "n"), [("quadrilateral", 1, (1, 6)), ("quadrilateral", 2, (1, 4))]
 )
-def test_there_and_back(cell, degree, n, method, condensation):
-    """A block pressed on a ball, rubbed there and back, and lifted."""
+def test_load_reversal_is_independent_of_units(cell, degree, n, method, condensation):
+    """A block is pressed on a ball, dragged in both directions, and lifted."""
     results = []
     for length, pressure in UNITS:
         made = Rub(
             fc.Coulomb(0.3),
             cell=cell,
             degree=degree,
-            # Distributed by hand: the partitioner does not distribute equal meshes equally.
+            # Own partitioner: the default one may partition equal meshes differently.
             mesh={"n": n[::-1], "size": length * np.ones(2), "partitioner": layers(cell)},
             length=length,
             pressure=pressure,
@@ -59,8 +59,8 @@ def test_there_and_back(cell, degree, n, method, condensation):
     same(results)
 
 
-# But for L-BFGS with Tresca's law: its open points keep friction, it takes up to 40 iterations, and
-# round-off has grown to all digits of its pairs by then.
+# Without L-BFGS for Tresca's law: open points have friction, so that it takes up to 40 iterations,
+# in which round-off grows to all digits of the L-BFGS pairs.
 IN_SPACE = [
     (law, method)
     for law in ("cone", "polygon", "ellipse", "Tresca", "multipliers")
@@ -71,8 +71,8 @@ IN_SPACE = [
 
 @pytest.mark.each
 @pytest.mark.parametrize(("law", "method"), IN_SPACE)
-def test_in_space(law, method):
-    """The same in space, with every surface of friction."""
+def test_friction_in_3d_is_independent_of_units(law, method):
+    """A block in 3D is pressed and dragged, with every friction law."""
     results = []
     for length, pressure in UNITS:
         made = Rub(
@@ -100,8 +100,8 @@ def test_in_space(law, method):
 @pytest.mark.skipif(COMM.size > 1, reason="equal meshes are not distributed equally")
 @pytest.mark.parametrize("condensation", CONDENSATION)
 @pytest.mark.parametrize("method", METHODS)
-def test_two_bodies(method, condensation):
-    """A block on another one, whose surfaces touch from the start: pressed, rubbed, and back."""
+def test_two_bodies_are_independent_of_units(method, condensation):
+    """A block in touch with another one is pressed, and dragged in both directions."""
     results = []
     for length, pressure in UNITS:
         mesh, tags = two_blocks("triangle", (5, 4))

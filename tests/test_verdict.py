@@ -1,4 +1,4 @@
-"""The verdict on a solution: what is wrong does not pass, be it in the law, forces or places."""
+"""The verdict on a solution detects errors of laws, forces and their points of application."""
 
 import numpy as np
 import pytest
@@ -16,19 +16,19 @@ COMM = MPI.COMM_WORLD
 
 
 class Changed(fc.Coulomb):
-    """Coulomb's law with a response that breaks what it claims."""
+    """Coulomb's law with one result that violates it."""
 
     def __init__(self, what: str) -> None:
-        """``what``: the claim to break."""
+        """Store ``what``, the result to change."""
         super().__init__(0.3, k_n=2e4, k_t=1e4)
         object.__setattr__(self, "what", what)
 
     def parameters(self):
-        """Those of Coulomb's law."""
+        """Return the parameters of Coulomb's law."""
         return {"friction": self.friction, "k_n": self.k_n, "k_t": self.k_t}
 
     def contact_traction(self, kinematics, parameters):
-        """Coulomb's, with one entry changed."""
+        """Return the traction of Coulomb's law with one entry changed."""
         r = super().contact_traction(kinematics, parameters)
         parts = {name: getattr(r, name) for name in r.__dataclass_fields__}
         if self.what == "cone":
@@ -46,8 +46,8 @@ class Changed(fc.Coulomb):
         return fc.ContactTraction(**parts)
 
 
-def test_the_changed_law_is_sound_when_nothing_is_changed():
-    """The same law with nothing broken passes: what fails below fails for its fault."""
+def test_unchanged_law_passes():
+    """The same law without a change passes: the failures below are due to the changes."""
     made = Rub(Changed("nothing"), method="newton")
     steps = walk(made, path=PATH[:3])
     assert steps[-1].contacts["contact"].slip > 0
@@ -58,8 +58,8 @@ def test_the_changed_law_is_sound_when_nothing_is_changed():
 @pytest.mark.parametrize(
     "what", ["cone", "friction bound", "stiffness", "adhesion", "slip", "direction"]
 )
-def test_a_law_that_lies_is_caught(what):
-    """Reactions that break the cone, complementarity or the flow rule do not pass as a solution."""
+def test_violated_law_is_detected(what):
+    """Tractions that violate cone, complementarity or flow rule do not pass as a solution."""
     made = Rub(Changed(what), method="newton")
     before = snapshot(made)
     with pytest.raises(fc.NotConverged) as caught:
@@ -72,8 +72,8 @@ def test_a_law_that_lies_is_caught(what):
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("factor", [0.9, 1.0 + 1e-4])
-def test_a_wrong_contact_residual_is_caught(method, factor, monkeypatch):
-    """A contact residual that is not the integral of the tractions: forces do not balance."""
+def test_wrong_contact_residual_is_caught(method, factor, monkeypatch):
+    """Forces do not balance if the contact residual is not the integral of the tractions."""
     made = Rub(method=method)
     right = fc.ContactOperator.add_force
 
@@ -91,8 +91,8 @@ def test_a_wrong_contact_residual_is_caught(method, factor, monkeypatch):
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_forces_at_wrong_places_are_caught(cell, monkeypatch):
-    """Forces of the right sum, each acting where another point of Γc is: moments do not balance."""
+def test_forces_at_wrong_points_are_caught(cell, monkeypatch):
+    """Moments do not balance if each force, of the right sum, acts at another point of Γc."""
     made = Rub(cell=cell)
     right, contact = fc.ContactOperator.add_force, made.contact
 
@@ -110,10 +110,11 @@ def test_forces_at_wrong_places_are_caught(cell, monkeypatch):
 
 @pytest.mark.parametrize("condensation", [None, False])
 @pytest.mark.parametrize("factor", [1.0, 1.0 + 1e-9])
-def test_forces_by_a_second_route(factor, condensation):
+def test_nodal_forces_agree_with_the_form(factor, condensation):
     """A map from u to the points that is wrong by 1e-9 differs from DOLFINx's assembly of the form.
 
-    What the solver, the laws and the sums of forces make of it agrees, within their tolerances.
+    The results of the solver, the laws and the sums of forces agree with it within their
+    tolerances.
     """
     made = Rub(cross_check=True, condensation=condensation)
     made.contact.pairs.own_map.scale(factor)
@@ -130,8 +131,8 @@ def test_forces_by_a_second_route(factor, condensation):
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
-def test_a_premature_end_is_caught(method, monkeypatch):
-    """SNES that claims convergence at its first look is not believed; the state is as before."""
+def test_premature_convergence_is_caught(method, monkeypatch):
+    """Convergence claimed by SNES at its first check is refused; the state is as before."""
     made = Rub(method=method, fallback=False)
     walk(made, path=PATH[:1])
     before = snapshot(made)
@@ -144,8 +145,8 @@ def test_a_premature_end_is_caught(method, monkeypatch):
     assert identical(snapshot(made), before)
 
 
-def test_the_verdict_of_a_solution():
-    """A step carries its verdict: residual within tolerance, laws to 1e-10, forces balanced."""
+def test_verdict_of_a_solution():
+    """A step has its verdict: residual within tolerance, laws to 1e-10, balance of forces."""
     made = Rub()
     for step in walk(made):
         verdict = step.verdict
@@ -168,8 +169,8 @@ def test_the_verdict_of_a_solution():
         (1.0, np.inf, False),
     ],
 )
-def test_a_balance_and_its_condition(residual, tolerance, holds):
-    """Both hold where all is finite and the residual no larger than the tolerance, 0 included."""
+def test_force_balance_and_its_condition(residual, tolerance, holds):
+    """Both hold if all numbers are finite and the residual is at most the tolerance, 0 included."""
     balance = ForceBalance(residual, 0.0, tolerance)
     assert (balance.excess() <= 1.0) == holds
     assert balance.holds() == balance.condition("", "").holds == holds

@@ -1,4 +1,4 @@
-"""Verification cases without a demo meet their references; the pages are complete.
+"""Verification cases without a demo agree with their references; the pages are complete.
 
 References, tolerances and their reasons are in ``verification/``.
 """
@@ -23,15 +23,15 @@ pytestmark = pytest.mark.mpi
         for c in CASES
     ],
 )
-def test_case(case):
-    """Every quantity within its tolerance."""
+def test_quantities_agree_with_their_references(case):
+    """Every quantity of a case is within its tolerance."""
     made = case.run()
     missed = [row for row in made.rows if not row.passed]
     assert made.rows and not missed, missed
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1.1])
-def test_errors_above_the_tolerance_are_missed(value):
+def test_errors_above_the_tolerance_do_not_pass(value):
     """NaN, infinity and errors above the tolerance do not pass."""
     assert not Row("q", value, 1.0, "s", 0.05).passed
     assert Row("q", 1.04, 1.0, "s", 0.05).passed
@@ -44,8 +44,8 @@ ONE_PROCESS = pytest.mark.skipif(
 
 
 @ONE_PROCESS
-def test_misses_and_failures_are_shown(tmp_path, monkeypatch, capsys):
-    """They are on the page and in the exit code, and later cases are still run."""
+def test_missed_references_and_failed_cases_are_reported(tmp_path, monkeypatch, capsys):
+    """Both are reported on the page and by the exit code, and later cases are run."""
 
     def broken():
         raise RuntimeError("no answer")
@@ -78,8 +78,8 @@ def test_misses_and_failures_are_shown(tmp_path, monkeypatch, capsys):
 
 
 @ONE_PROCESS
-def test_page_follows_from_stored_values():
-    """The page is that of the stored values of all cases, which meet their references."""
+def test_page_is_generated_from_the_stored_values():
+    """The page is that of the stored values of all cases, and all agree with their references."""
     rows = report.read(run.PAGE.with_suffix(".csv"))
     stored = list(dict.fromkeys(row["case"] for row in rows))
     assert stored == [case.name for case in [*run.DEMOS, *run.CASES]]
@@ -87,8 +87,8 @@ def test_page_follows_from_stored_values():
     assert run.page(rows) == run.PAGE.read_text()
 
 
-def test_estimates_of_a_case():
-    """The only error of the patch test is the penalty; its estimate is exact to first order."""
+def test_error_estimates_of_the_patch_test():
+    """The only error of the patch test is the penalty; estimates are exact to first order."""
     found = list(statics.patch().estimates())
     assert len(found) == 6
     for e in found:
@@ -96,8 +96,8 @@ def test_estimates_of_a_case():
 
 
 @ONE_PROCESS
-def test_page_of_effectivities_follows_from_stored_values():
-    """Every case has a row or a reason; the rows of a demo begin with its name."""
+def test_effectivity_page_is_generated_from_the_stored_values():
+    """Every case has a row or a reason for none; the rows of a demo begin with its name."""
     rows = report.read(effectivity.PAGE.with_suffix(".csv"))
     assert effectivity.page(rows) == effectivity.PAGE.read_text()
     stored = {row["case"] for row in rows}

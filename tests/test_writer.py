@@ -1,7 +1,7 @@
-"""Files for ParaView, read back by their format (`scenes.vtu`), against fields known otherwise.
+"""Files for ParaView, read back by `scenes.vtu`, agree with known fields.
 
-References: polynomials that the elements contain, met to round-off (1e-10 of the largest value),
-and the contact's own values at its points, which are written as they are.
+References: polynomials that the elements represent, met to round-off (1e-10 of the largest value),
+and the contact's values at its quadrature points, which are written unchanged.
 """
 
 import os
@@ -25,7 +25,7 @@ COMM = MPI.COMM_WORLD
 
 pytestmark = [pytest.mark.three_ranks, pytest.mark.timeout(120)]
 
-# Where VTK's own classes of cells say that their nodes are, in reference coordinates.
+# Reference coordinates, times two, of the nodes of a cell as defined by VTK's classes.
 NODES = {
     21: "000 200 100",
     22: "000 200 020 100 110 010",
@@ -36,12 +36,12 @@ NODES = {
 }
 LINEAR = {3: 21, 5: 22, 9: 28, 10: 24, 12: 29}
 VTK = {"triangle": (5, 3), "quadrilateral": (9, 3), "tetrahedron": (10, 5), "hexahedron": (12, 9)}
-# Volume of a reference cell by that of the box its edges span.
+# Volume of a reference cell, relative to the box that its edges span.
 PART = {3: 1, 5: 1 / 2, 9: 1, 10: 1 / 6, 12: 1}
 
 
 def reference(kind):
-    """Reference coordinates of the nodes of a kind of cell."""
+    """Return the reference coordinates of the nodes of a VTK cell type."""
     places = NODES[LINEAR.get(kind, kind)].split()
     places = np.array([[int(c) / 2 for c in place] for place in places])
     return places[np.all(places % 1 == 0, axis=1)] if kind in LINEAR else places
@@ -52,7 +52,7 @@ def linear_kind(kind):
 
 
 def content(grid):
-    """Sum of the cells' lengths, areas or volumes, by their corners."""
+    """Return the total length, area or volume of the cells, from their corners."""
     kind = linear_kind(grid.kind)
     corners = len(reference(kind))
     x = grid.x[:, :corners]
@@ -84,8 +84,8 @@ def in_plane(values, d):
 
 
 @pytest.mark.parametrize("cell,degree", GRID)
-def test_cells_nodes_and_fields(cell, degree, tmp_path):
-    """Cells turned at random, on any number of ranks: all of the body and of Γc, once each."""
+def test_cells_nodes_and_fields_are_exact(cell, degree, tmp_path):
+    """With shuffled cells, on any number of ranks, all of body and Γc is written exactly once."""
     folder, d = shared_folder(tmp_path), dimension(cell)
     made = Rub(cell=cell, degree=degree, mesh={"n": 2, "shuffled": True})
     field = polynomial(d, degree, 3, 0.1)
@@ -101,7 +101,7 @@ def test_cells_nodes_and_fields(cell, degree, tmp_path):
     assert abs(content(body) - 1) <= 1e-12 and abs(content(surface) - 1) <= 1e-12
     assert np.abs(surface.x[..., d - 1]).max() <= 1e-15
     for grid in (body, surface):
-        # Nodes lie where the reference coordinates say, by the corners' own interpolation.
+        # Nodes are at their reference coordinates, interpolated from the corners.
         at, corners = reference(grid.kind), reference(linear_kind(grid.kind))
         if linear_kind(grid.kind) in (5, 10):
             weights = np.column_stack([1 - at.sum(axis=1), at[:, : corners.shape[1]]])
@@ -136,8 +136,8 @@ def test_cells_nodes_and_fields(cell, degree, tmp_path):
 
 
 @pytest.mark.parametrize("cell", CELLS)
-def test_values_of_the_points(cell, tmp_path):
-    """At the points what the contact has; in facets nothing beyond their points, and the force."""
+def test_values_at_points_and_facets(cell, tmp_path):
+    """Points have the contact's values; facets stay within them and preserve the force."""
     folder, d = shared_folder(tmp_path), dimension(cell)
     made = Rub(cell=cell, degree=2, mesh={"n": 3})
     made.problem.small_displacement_tolerance = np.inf
@@ -162,7 +162,7 @@ def test_values_of_the_points(cell, tmp_path):
     facets = vtu.read(folder / "contact_0001.vtu")
     pressure = facets.at_nodes["pressure"]
     assert pressure.min() == 0.0 and pressure.max() <= expected["pressure"].max()
-    # The force of linear fields: their mean by the corners, on equal facets.
+    # The force of a linear field on equal facets is the mean of its corner values.
     corners = {3: 2, 5: 3, 9: 4}[linear_kind(facets.kind)]
     force = pressure[:, :corners].mean(axis=1).sum() / len(pressure)
     assert close(force, step.contacts["contact"].normal_force, 1e-10)
@@ -170,7 +170,7 @@ def test_values_of_the_points(cell, tmp_path):
     by_facet = points.at_nodes["status"][:, 0].reshape(-1, per_facet)
     most = [np.bincount(row, minlength=3).argmax() for row in by_facet]
     assert np.array_equal(facets.in_cells["status"], most)
-    # Facets and points are in the same order, and move alike.
+    # Facets and points are in the same order, with the same displacement.
     middle = points.x[:, 0].reshape(-1, per_facet, 3).mean(axis=1)
     assert close(facets.x[:, :corners].mean(axis=1), middle, 1e-12)
     moved = points.at_nodes["displacement"][:, 0]
@@ -181,8 +181,8 @@ def test_values_of_the_points(cell, tmp_path):
     assert close(moved[order][:, :d], mine, 1e-12)
 
 
-def test_facets_stay_within_their_points():
-    """What is linear is kept between the points; beyond, nothing leaves their range."""
+def test_facet_values_stay_within_point_values():
+    """Linear fields are exact between the points; no extrapolated value leaves their range."""
     rng = np.random.default_rng(1)
     gauss = 0.5 + 0.5 * np.array([-(0.6**0.5), 0.0, 0.6**0.5])
     weights = np.array([5, 8, 5]) / 18
@@ -195,12 +195,12 @@ def test_facets_stay_within_their_points():
     assert np.all(found >= values.min(axis=1, keepdims=True))
     assert np.all(found <= values.max(axis=1, keepdims=True))
     assert close(found.mean(axis=1), np.einsum("p,fpk->fk", weights, values), 1e-13)
-    assert found[0, 0, 0] == 0.0  # a fit alone has -368 here
-    assert close(found[0, :, 1], [1.0, 3.0], 1e-13)  # rises on all the way
-    # At the points themselves what is linear is met.
+    assert found[0, 0, 0] == 0.0  # a linear fit gives -368 here
+    assert close(found[0, :, 1], [1.0, 3.0], 1e-13)  # increases along the whole facet
+    # Linear fields are exact at the points.
     line = 3 - 2 * points[:, :, 0] + points[:, :, 1] ** 0
     assert close(facet_values(points, measure, line, points), line, 1e-13)
-    # One point tells a constant; points without a value do not count.
+    # A single point gives a constant; points without a value are ignored.
     one = facet_values(points[:1, :1], measure[:1, :1], np.array([[7.0]]), ends[:1])
     assert one.tolist() == [[7.0, 7.0]]
     holes = np.array([[np.nan, 2.0, 4.0], [np.nan] * 3])
@@ -217,22 +217,22 @@ def files(folder):
 
 
 def written(folder, name="floor"):
-    """Times, loads and largest pressures of a series."""
+    """Return times, loads and largest pressures of a series."""
     states = [(time, vtu.read(folder / file)) for time, file in vtu.series(folder / f"{name}.pvd")]
     return [(t, grid.numbers["load"], grid.at_nodes["pressure"].max()) for t, grid in states]
 
 
-def test_a_history_that_is_resumed(tmp_path):
-    """Its series goes on: nothing twice, nothing lost, earlier files as they were."""
+def test_resumed_history_continues_the_series(tmp_path):
+    """No state is written twice or lost, and the files of earlier increments are unchanged."""
     folder = shared_folder(tmp_path)
     whole, made = Press(), Press()
     writer = fc.Writer(folder / "whole", whole.problem)
-    for step in whole.increments(4.0):  # there and back: loads come twice, increments do not
+    for step in whole.increments(4.0):  # load and unload: loads occur twice, increments once
         writer.write(step)
     writer = fc.Writer(folder / "parts", made.problem)
     for step in made.increments(4.0, checkpoint=folder / "state.npz", checkpoint_every=2):
         writer.write(step)
-        if step.increment == 5:  # beyond the checkpoint, which is of 4
+        if step.increment == 5:  # one after the checkpoint, at increment 4
             break
     before = files(folder / "parts")
     again = Press()
@@ -251,7 +251,7 @@ def test_a_history_that_is_resumed(tmp_path):
     now = files(folder / "parts")
     assert all(now[name] == before[name] for name in kept)
 
-    # Anew: the first state of it takes the place of all.
+    # The first state of a new history replaces the series.
     fresh = Press()
     writer = fc.Writer(folder / "parts", fresh.problem)
     writer.write(next(iter(fresh.increments(4.0))))
@@ -263,8 +263,8 @@ def test_a_history_that_is_resumed(tmp_path):
     assert sorted(files(folder / "parts")) == names
 
 
-def test_wrong_input(tmp_path):
-    """Errors on all ranks that say what to do; nothing is written."""
+def test_invalid_input_is_refused(tmp_path):
+    """Errors on all ranks state the remedy; nothing is written."""
     folder = shared_folder(tmp_path)
     made = Rub()
     (folder / "file").touch()
@@ -295,8 +295,8 @@ def test_wrong_input(tmp_path):
     raised_everywhere(lambda: fc.Writer(folder, made.problem), ValueError, "contact.pvd", "remove")
 
 
-def test_two_writers_in_a_folder(tmp_path):
-    """The second one would overwrite files that the series of the first one names."""
+def test_second_writer_in_a_folder_is_refused(tmp_path):
+    """A second writer would overwrite files that are listed in the series of the first one."""
     folder = shared_folder(tmp_path)
     made = Rub()
     first, second = (fc.Writer(folder, made.problem) for _ in range(2))
@@ -305,13 +305,13 @@ def test_two_writers_in_a_folder(tmp_path):
     raised_everywhere(lambda: second.write(2), ValueError, "body.pvd", "another one writes")
     assert files(folder) == before
     first.write(2)
-    fc.Writer(folder, made.problem).write(3)  # takes over
+    fc.Writer(folder, made.problem).write(3)  # replaces the first writer
     raised_everywhere(lambda: first.write(4), ValueError, "one Writer per folder")
     assert [time for time, _ in vtu.series(folder / "body.pvd")] == [1, 2, 3]
 
 
-def test_a_write_that_fails(tmp_path, monkeypatch):
-    """The series is as before, and goes on when there is room again."""
+def test_failed_write_leaves_the_series_unchanged(tmp_path, monkeypatch):
+    """After a failed write the series is unchanged, and the next write continues it."""
     folder = shared_folder(tmp_path)
     made = Rub()
     writer = fc.Writer(folder, made.problem)
@@ -331,8 +331,8 @@ def test_a_write_that_fails(tmp_path, monkeypatch):
     assert {**files(folder), **{n: before[n] for n in before if ".vtu" in n}} == files(folder)
 
 
-def test_a_field_that_is_behind(tmp_path):
-    """It is completed first: the body in the file is that of the increment."""
+def test_interior_displacement_is_recovered_before_writing(tmp_path):
+    """With ``recover_interior="last"`` the file has the displacement of its increment, to 1e-8."""
     folder = shared_folder(tmp_path)
     grids = []
     for name, field in (("every", "every"), ("last", "last")):
@@ -349,8 +349,8 @@ def test_a_field_that_is_behind(tmp_path):
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_finite_kinematics(cell, tmp_path):
-    """True pressures beside nominal ones, by the stretch of Γc where it has moved to."""
+def test_true_and_nominal_pressure_with_finite_kinematics(cell, tmp_path):
+    """The true pressure is the nominal one divided by the area stretch of Γc, to 1e-12."""
     folder = shared_folder(tmp_path)
     made = Tool(cell)
     writer = fc.Writer(folder, made.problem, stress=made.scene.body.stress)
@@ -361,7 +361,7 @@ def test_finite_kinematics(cell, tmp_path):
     stretch = np.concatenate(COMM.allgather(contact.area_stretch()))
     pressure = np.concatenate(COMM.allgather(contact.pressure))
     closed = pressure > 0
-    assert np.abs(stretch[closed] - 1).max() > 1e-3  # else nothing would be told apart
+    assert np.abs(stretch[closed] - 1).max() > 1e-3  # otherwise the pressures would not differ
     ratio = np.sort((points["true_pressure"] / np.maximum(points["pressure"], 1e-9))[:, 0])
     expected = np.sort(np.where(closed, 1 / stretch, 0.0))
     assert close(ratio, expected, 1e-12)
@@ -369,8 +369,8 @@ def test_finite_kinematics(cell, tmp_path):
     assert body["von_mises"].min() >= 0 and body["von_mises"].max() > 0
 
 
-def test_an_axis_has_a_stress(tmp_path):
-    """Where u_r/r is 0/0 the file has the value that the points inside lead to."""
+def test_stress_on_the_axis_of_symmetry(tmp_path):
+    """Where u_r/r is 0/0 the stress is extrapolated from points inside the cells, to 1e-10."""
     folder = shared_folder(tmp_path)
     made = Rub(degree=2)
     body = fc.elasticity.LinearElastic(made.scene.u, 1000.0, 0.3, "axisymmetric")
@@ -383,8 +383,8 @@ def test_an_axis_has_a_stress(tmp_path):
     assert close(grid.at_nodes["stress"], np.tile(exact.ravel(), (*grid.x.shape[:2], 1)), 1e-10)
 
 
-def test_a_mixed_function(tmp_path):
-    """The displacement is that part of it; Γc moves with the body."""
+def test_mixed_function_writes_its_displacement(tmp_path):
+    """The displacement of the mixed function is written, equal on the body and on Γc to 1e-12."""
     folder = shared_folder(tmp_path)
     made = Tool(mixed="Taylor-Hood", nu=0.5, law=fc.Frictionless(1e4))
     writer = fc.Writer(folder, made.problem, stress=made.scene.body.stress)
