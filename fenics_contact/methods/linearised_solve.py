@@ -15,8 +15,9 @@ from fenics_contact.types import Array
 
 __all__ = ["linearised_solver", "solve_response"]
 
-# Relative tolerance, of tractions at fixed displacements, of which stiff contact leaves a small
-# part (1e-3 refuses a right solution with k h/E = 2000 by multigrid); residual of a failure.
+# Residuals relative to the change of the tractions at fixed displacements; the second is that of a
+# failure. Displacements cancel most of this change if contact is stiff: 1e-3 is too large with
+# k h/E = 2000 and multigrid.
 _RESPONSE_RTOL, _FAILED_RTOL = 1e-4, 1e-2
 
 

@@ -149,7 +149,7 @@ class RigidBodyModes(RigidMotions):
 
     def _bound_work(self, load: Array) -> Array:
         """Return this rank's part of a bound of the work of a load on free modes, (n_free,)."""
-        # No motion of a part displaces any of its dofs by more than one.
+        # No motion displaces any dof of the undeformed bodies by more than one.
         sizes = np.bincount(self._scales.label, np.abs(load), minlength=len(self._scales.group))
         n_obstacles, n_per_body = self._unknowns.n_motions, len(self.of_bodies)
         repeats = np.append(np.full(self._n_bodies, n_per_body), np.ones(n_obstacles, dtype=int))

@@ -122,7 +122,7 @@ class RigidMotions:
         return self._split(self.matrix @ values)[0]
 
     def by_body_on(self, system: System, values: Array) -> Array:
-        """Return `by_body` for the values of a system of fewer unknowns. Collective."""
+        """Return `by_body` for values at all or the retained unknowns of a system. Collective."""
         if system is self._full:
             return self.by_body(values)
         n = self._n_bodies
