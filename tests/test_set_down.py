@@ -564,12 +564,14 @@ def test_unloaded_block_keeps_its_position_until_it_is_pushed():
 def test_vertical_load_does_not_move_a_block_sideways(kinematics, n_steps, n_walls, gap):
     """Walls with friction squeeze a block and open; its weight is removed and applied again.
 
-    Reference: statics, and no displacement along the floor. Positioned from gaps of round-off, the
-    block moved to a wall, as far as that had opened, and the wall carried 15 % of its weight.
+    Reference: statics, and no displacement along the floor. Positioned from gaps of round-off, or
+    by a horizontal load of 1e-15 of the weight, the block moved to a wall, as far as
+    that had opened, and the wall carried 15 % of its weight.
     """
     scene = Beside({"block": Box(n=(4, 4))}, E=1e3)
-    weight = scene.bodies.constant(0.0)
+    weight, round_off = scene.bodies.constant(0.0), scene.bodies.constant(0.0)
     scene.load("block", TOP, 1, weight)
+    scene.load("block", TOP, 0, round_off)
     obstacles = {BOTTOM: fc.HalfSpace((0, 0), (0, 1))}
     walls = [scene.bodies.constant((0.0, 0.0)) for _ in range(n_walls)]
     for side, x, wall in zip((LEFT, RIGHT), (0.0, 1.0), walls, strict=False):
@@ -581,7 +583,7 @@ def test_vertical_load_does_not_move_a_block_sideways(kinematics, n_steps, n_wal
     problem = scene.problem(*contacts, small_displacement_tolerance=np.inf)
 
     def solve(load, squeeze):
-        weight.value = -load
+        weight.value, round_off.value = -load, -1e-15 * load
         for wall, sign in zip(walls, (1, -1), strict=False):
             wall.value[0] = sign * squeeze
         problem.solve()

@@ -53,10 +53,8 @@ class Verifier:
         self._warned_errors: dict[str, float] = {}
         self._warned_round_off: set[str] = set()
         self._warned_resolution: set[tuple[str, str]] = set()
-        products = np.array([motions.by_body(motion) for motion in motions.of_bodies])
-        products = np.moveaxis(products, 0, 2)
         # The pseudo-inverse serves bodies of one node, without rotations.
-        self._inverse = np.linalg.pinv(global_sum(self._comm, products), hermitian=True)
+        self._inverse = np.linalg.pinv(motions.gram_by_body(), hermitian=True)
 
     def verify(
         self,

@@ -197,17 +197,25 @@ class InitialPositioning:
 
     def _at_points(self, modes: Index) -> list[Array]:
         """Return jumps of free modes by contact, (n_modes, n_points, gdim). Collective."""
-        return [jumps[modes] for jumps in self.motions.present_at_points(self.full.operators)]
+        motions = self.motions
+        jumps = motions.jumps_at_points(self.full.operators, motions.present_matrix())
+        return [by_mode[modes] for by_mode in jumps]
 
     def _find_free_modes(self, modes: Index) -> _FreeModes | None:
         """Evaluate the free modes; None if they are unloaded. Collective."""
-        load = self.motions.present_load(self.load)[modes]
+        motions, contacts = self.motions, self.full.contacts
+        matrix, free = motions.present_matrix(), motions.free[modes]
+        load = motions.work_of_load(self.load, matrix)[modes]
         largest = np.abs(load).max()
-        gram = self.motions.present_gram()[np.ix_(modes, modes)]
-        kinematics = [contact.contact_kinematics for contact in self.full.contacts]
-        at_points = self._at_points(modes)
-        jumps = [o.rotate_to_displaced(j) for o, j in zip(kinematics, at_points, strict=True)]
-        return _FreeModes(modes, load / largest, gram, jumps) if largest > 0 else None
+        if not largest > 0:
+            return None
+        jumps = [
+            contact.contact_kinematics.rotate_to_displaced(by_mode[modes])
+            for contact, by_mode in zip(
+                contacts, motions.jumps_at_points(self.full.operators, matrix), strict=True
+            )
+        ]
+        return _FreeModes(modes, load / largest, free @ motions.gram(matrix) @ free.T, jumps)
 
     def _displace(self, modes: Index, coefficients: Array) -> None:
         """Displace bodies by free modes with these coefficients. Collective."""

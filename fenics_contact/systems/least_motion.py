@@ -53,7 +53,8 @@ def find_least_motion(
         Change in free motions, (n_free,) (length); None if the constraints are infeasible.
     """
     comm, scales = full.unknowns.comm, full.scales
-    at_points = motions.present_at_points(full.operators)
+    matrix = motions.present_matrix()
+    at_points = motions.jumps_at_points(full.operators, matrix)
     rows = [np.zeros((0, len(modes) + 1))]
     closed = closed or [np.zeros(len(values.gap)) for values in states]
     points = zip(full.operators, at_points, states, among, closed, strict=True)
@@ -70,7 +71,7 @@ def find_least_motion(
         limit = np.where(is_touching, 0.0, gap - NEGLIGIBLE * size)
         rows.append(np.column_stack([closing, limit])[is_coupled])
     limits = gather_rows(comm, np.concatenate(rows))
-    mass = motions.present_gram()
+    mass = motions.free @ motions.gram(matrix) @ motions.free.T
     turns = motions.free * (motions.turns > 0.0)
     norm = modes @ (mass + _ROTATION_WEIGHT * mass.max() * turns @ turns.T)
     change = minimise_norm(norm @ modes.T, norm @ displacement, limits[:, :-1], limits[:, -1])

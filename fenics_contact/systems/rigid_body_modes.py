@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse
 from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
@@ -41,17 +42,16 @@ class RigidBodyModes(RigidMotions):
         """
         n_obstacles = self._unknowns.n_motions
         stiffest = np.append(self._scales.stiffness, np.ones(n_obstacles))[self._scales.label]
-        gram = []
+        rows = []
         work, image = stiffness.createVecs()
         for motion in self.of_bodies:
             work.array[:] = motion  # all bodies at once: the bulk does not couple them
             stiffness.mult(work, image)
             fixed = np.where(constrained, motion, 0.0)
-            energy = self.by_body(image.array / stiffest + fixed)
-            gram.append([energy, self.by_body(motion)])
-        energy, mass = np.moveaxis(global_sum(self.comm, np.array(gram)), 0, 3)
+            rows.append(self.by_body(image.array / stiffest + fixed))
+        energy = np.moveaxis(global_sum(self.comm, np.array(rows)), 0, 2)
         free: list[Array] = []
-        for body_energy, body_mass in zip(energy, mass, strict=True):
+        for body_energy, body_mass in zip(energy, self.gram_by_body(), strict=True):
             scale = 1 / np.sqrt(np.diag(body_mass))
             symmetric = (body_energy + body_energy.T) / 2
             values, vectors = np.linalg.eigh(symmetric * np.outer(scale, scale))
@@ -121,30 +121,30 @@ class RigidBodyModes(RigidMotions):
         """Return the free motions at the present positions, (n_free, n_local)."""
         return np.asarray((self.present_matrix().T @ self.free.T).T)
 
-    def present_at_points(self, operators: Sequence[ContactOperator]) -> list[Array]:
-        """Return the jumps of `present_fields` by contact, (n_free, n_points, gdim). Collective."""
-        if self._full.bulk.linear:
+    def jumps_at_points(
+        self, operators: Sequence[ContactOperator], matrix: scipy.sparse.csc_matrix
+    ) -> list[Array]:
+        """Return the jumps of the free motions by contact, (n_free, n_points, gdim). Collective.
+
+        ``matrix`` is the `present_matrix`.
+        """
+        if matrix is self.matrix:
             return [self.at_points(operator) for operator in operators]
-        shape, matrix = (len(self.free), -1, self._x.shape[1]), self.present_matrix()
+        shape = len(self.free), -1, self._x.shape[1]
         fields = [matrix.T @ row for row in self.free]
         return [np.array([o.jump(field) for field in fields]).reshape(shape) for o in operators]
 
-    def present_gram(self) -> Array:
-        """Return the products of `present_fields` with each other, (n_free, n_free). Collective."""
-        matrix = self.present_matrix()
-        products = global_sum(self.comm, (matrix @ matrix.T).toarray())
-        return np.asarray(self.free @ products @ self.free.T)
-
-    def present_load(self, load: Array) -> Array:
-        """Return the work of a load on `present_fields`, 0 where it is round-off. Collective.
+    def work_of_load(self, load: Array, matrix: scipy.sparse.csc_matrix) -> Array:
+        """Return the work of a load on the free motions, 0 where it is round-off. Collective.
 
         Args:
             load: External forces at this rank's unknowns (force).
+            matrix: The `present_matrix`.
 
         Returns:
             Array (n_free,) (force).
         """
-        sums = np.stack([self.free @ (self.present_matrix() @ load), self._bound_work(load)])
+        sums = np.stack([self.free @ (matrix @ load), self._bound_work(load)])
         return _without_round_off(*global_sum(self.comm, sums))
 
     def _bound_work(self, load: Array) -> Array:
@@ -239,7 +239,7 @@ class RigidBodyModes(RigidMotions):
         gram: Array = np.zeros((n, n))
         area: Array = np.zeros(n)
         unknown: Array = np.zeros(scales.n_groups)
-        at_points = self.present_at_points(operators)
+        at_points = self.jumps_at_points(operators, self.present_matrix())
         for number, (operator, modes) in enumerate(zip(operators, at_points, strict=True)):
             contact, weights = operator.contact, operator.contact.quadrature.weights
             has_jump = np.abs(modes).max(axis=2, initial=0.0) > NEGLIGIBLE

@@ -9,6 +9,7 @@ import scipy.linalg
 import scipy.sparse
 
 from fenics_contact import compat
+from fenics_contact.parallel import global_sum
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.modes import rigid_motions
 from fenics_contact.systems.operator import ContactOperator
@@ -97,6 +98,20 @@ class RigidMotions:
         if self._full.bulk.linear:
             return self.matrix
         return self._assemble_matrix(self._of_bodies_at(self._node_positions()))
+
+    def gram(self, matrix: scipy.sparse.csc_matrix) -> Array:
+        """Return the products of all motions of a `matrix`, (n_motions, n_motions). Collective."""
+        return np.asarray(global_sum(self.comm, (matrix @ matrix.T).toarray()))
+
+    def gram_by_body(self) -> Array:
+        """Return the products of the motions of every undeformed body with each other. Collective.
+
+        Returns:
+            Array (n_bodies, n_per_body, n_per_body).
+        """
+        n, k = self._n_bodies, len(self.of_bodies)
+        blocks = self.gram(self.matrix)[: n * k, : n * k].reshape(n, k, n, k)
+        return np.asarray(np.moveaxis(np.diagonal(blocks, axis1=0, axis2=2), -1, 0))
 
     def _assemble_field(self, displacement: Array, obstacles: Array) -> Array:
         """Return the unknowns for nodal displacements, (n_nodes, gdim), and obstacles."""
