@@ -1,1 +1,1 @@
-"""Scripts that measure what contact costs; `run.py` starts them and joins what they find."""
+"""Scripts that measure the cost of contact; `run.py` runs them and collects their results."""

@@ -1,10 +1,10 @@
-"""Uniform and adaptive refinement: error in the energy norm over the number of dofs.
+"""Compare uniform and adaptive refinement: error in the energy norm over the number of dofs.
 
     python benchmarks/adaptation.py
 
 A rigid cylinder (R = 4) is pressed into a unit block, half of which is modelled with quadratic
 triangles: without friction, and with μ = 0.3 in four increments. The error in the energy norm is
-estimated. The table includes contact force and peak pressure.
+estimated. The table also has contact force and peak pressure.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scenes.indented import half_block, press
 
 
 def main() -> None:
-    """Refine uniformly and adaptively; write the table."""
+    """Refine uniformly and adaptively, and write the table."""
     arguments = parser(__doc__, "adaptation").parse_args()
     rows = []
     for friction in (0.0, 0.3):

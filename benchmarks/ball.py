@@ -1,13 +1,13 @@
-"""Rigid ball on an elastic block, 3D, with friction: cost relative to one linear solve.
+"""Measure the cost of a rigid ball on an elastic block in 3D relative to one linear solve.
 
-A quarter of the block by symmetry, hexahedra graded towards the contact, one increment. Compared
-are this package with its defaults, with static condensation, and on all dofs with multigrid; a
-hand-written penalty form in DOLFINx with Newton's method, each step solved by MUMPS' LU or by GMRES
-with GAMG and the rigid-body modes as near-nullspace; and one linear solve of the body, by
-factorisation and by multigrid. All residuals are below 1e-9 of the forces. Meshing is not included,
-the compilation of forms is separate. Errors of force, peak pressure and displacement at the end of
-Γc are relative to a finer mesh of ``--reference`` cells per side with three times the contact
-stiffness, so that the penalty error is included.
+A quarter of the block is modelled by symmetry, with hexahedra graded towards the contact, with
+friction, in one increment. Compared are this package with its defaults, with static condensation,
+and on all dofs with multigrid; a hand-written penalty form in DOLFINx with Newton's method, each
+step solved by MUMPS' LU or by GMRES with GAMG and the rigid-body modes as near-nullspace; and one
+linear solve of the body, by factorisation and by multigrid. All residuals are below 1e-9 of the
+forces. Meshing is not included, and the compilation of forms is timed separately. Errors of force,
+peak pressure and displacement at the end of Γc are relative to a finer mesh of ``--reference``
+cells per side with three times the contact stiffness, so that the penalty error is included.
 
     OMP_NUM_THREADS=1 python benchmarks/ball.py              # ten minutes
     OMP_NUM_THREADS=1 python benchmarks/ball.py --short
@@ -40,7 +40,7 @@ def runs(case: costs.Case, friction: float) -> dict[str, Callable[[], costs.Row]
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the benchmark and write its results."""
     parser = costs.parser(__doc__, "ball")
     parser.add_argument(
         "--cells", type=int, nargs="+", default=[7, 11, 16, 23, 32], help="cells per side"

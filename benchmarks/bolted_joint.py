@@ -1,9 +1,9 @@
-"""Bolted joint: cost of each increment, and of the refusal of a load above the friction limit.
+"""Measure the cost of increments of a bolted joint, and of the refusal of an overload.
 
-Two plates and a bolt, connected by friction only (``scenes/bolted_joint.py``), quadratic
-tetrahedra, three contacts between pairs of bodies: preloaded in two increments, pulled to 2000 N in
-four, then with a force 5 % above the friction limit, for which there is no equilibrium. Times are
-in units of one linear solve of the same bodies with Dirichlet conditions on each (MUMPS' Cholesky
+Two plates and a bolt of quadratic tetrahedra (``scenes/bolted_joint.py``), connected by friction
+only in three contacts between pairs of bodies, are preloaded in two increments, pulled to 2000 N in
+four, then by a force 5 % above the friction limit, for which there is no equilibrium. Times are in
+units of one linear solve of the same bodies with Dirichlet conditions on each (MUMPS' Cholesky
 factorisation on as many ranks). Meshing and compilation are not included. There is no comparison
 with plain DOLFINx, which has no contact search.
 
@@ -32,7 +32,7 @@ from scenes.problems import count
 from scenes.processes import answer
 
 COMM = MPI.COMM_WORLD
-TIGHT, PULLED = 1.0, 3.0  # ends of the load parameter
+TIGHT, PULLED = 1.0, 3.0  # load parameter at the end of preload and pull
 INCREMENT = 0.5
 BEYOND = 1.05  # relative to the friction limit
 Row = timing.Row
@@ -50,7 +50,7 @@ def linear(made: joint.BoltedJoint, repeat: int) -> float:
         start = _now()
         costs.solve_once(u, F, bcs)
         times.append(_now() - start)
-    return statistics.median(times[1:])  # the first compiles
+    return statistics.median(times[1:])  # the first run compiles the forms
 
 
 def _now() -> float:
@@ -59,7 +59,7 @@ def _now() -> float:
 
 
 def child(size: float, degree: int, repeat: int) -> None:
-    """Solve all increments and print their rows as JSON, the last line of rank 0."""
+    """Solve all increments, and print their rows as JSON, the last line of rank 0."""
     for _ in joint.BoltedJoint(8.0, degree=degree).increments(INCREMENT, steps=1):
         pass  # compiles the forms
     made = joint.BoltedJoint(size, degree=degree)
@@ -93,7 +93,7 @@ def child(size: float, degree: int, repeat: int) -> None:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the benchmark and write its results."""
     parser = timing.parser(__doc__, "bolted_joint")
     parser.add_argument("--size", type=float, nargs="*", default=[2.1], help="cell size (mm)")
     parser.add_argument("--degree", type=int, default=2)

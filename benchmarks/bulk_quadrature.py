@@ -1,10 +1,10 @@
-"""Quadrature of a neo-Hookean bulk: time of the tangent, and difference of the residual.
+"""Compare quadrature degrees of a neo-Hookean bulk: time of the tangent, error of the residual.
 
 UFL estimates a quadrature degree from the products in a form. For the neo-Hookean residual, with
-det F and F⁻ᵀ, it is several times that which the displacement of degree p needs. Compared are the
-estimate and 2p + 1, on a cube of one material, stretched by 20 % with a varying part of 5 %: the
-time to assemble the tangent, and the norm of the difference of the nodal forces relative to that of
-the forces.
+det F and F⁻ᵀ, the estimate is several times the degree that displacements of degree p require. It
+is compared with 2p + 1 on a homogeneous cube, stretched by 20 % with a varying part of 5 %, by the
+time to assemble the tangent, and by the norm of the difference of the nodal forces relative to that
+of the forces.
 
     OMP_NUM_THREADS=1 python benchmarks/bulk_quadrature.py           # three minutes
     OMP_NUM_THREADS=1 python benchmarks/bulk_quadrature.py --short
@@ -30,12 +30,12 @@ ESTIMATED = "UFL's estimate"
 
 
 def stretch(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the displacement at positions, (3, n) each."""
+    """Return the displacement at positions x; both have shape (3, n)."""
     return 0.2 * x * np.array([[1.0], [-0.4], [-0.4]]) + 0.05 * np.sin(np.pi * x[[1, 2, 0]])
 
 
 def study(cell: str, degree: int, n: int, repeat: int) -> list[timing.Row]:
-    """Time the tangents of one element on n cells per side."""
+    """Time the assembly of the tangents of one element on n cells per side."""
     mesh = dolfinx.mesh.create_unit_cube(MPI.COMM_WORLD, n, n, n, CellType[cell])
     u = fem.Function(displacement_space(mesh, degree))
     u.interpolate(stretch)
@@ -71,7 +71,7 @@ def study(cell: str, degree: int, n: int, repeat: int) -> list[timing.Row]:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the benchmark and write its results."""
     arguments = timing.parser(__doc__, "bulk_quadrature").parse_args()
     if MPI.COMM_WORLD.size > 1:
         raise SystemExit("runs on one rank")

@@ -1,8 +1,8 @@
-"""Cost of contact in units of one linear solve: reference solvers, and the study of a problem.
+"""Measure the cost of contact in units of one linear solve of the same body.
 
-The reference solvers are those that a user of DOLFINx would write: one linear solve, and a penalty
-form with Newton's method (SNES ``newtonls``, consistent tangent) and LU by MUMPS or GMRES with
-GAMG.
+`study` times a problem on several meshes. The reference solvers are those that a user of DOLFINx
+would write: one linear solve, and a penalty form with Newton's method (SNES ``newtonls``,
+consistent tangent) and LU by MUMPS or GMRES with GAMG.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from scenes import problems
 from scenes.elasticity import hold
 
 YARDSTICK = "one linear solve"
-# Behind the name of a history with ``recover_interior="last"``.
+# Suffix of the names of histories with ``recover_interior="last"``.
 AT_END = ", interior at the end"
 PLAIN = {"direct": "plain DOLFINx, LU", "multigrid": "plain DOLFINx, GMRES + GAMG"}
-# Residual relative to the forces, for all runs; the default of the package.
+# Residual relative to the forces in all runs; the default of the package.
 TOLERANCE = 1e-9
 # Runs that take longer are not repeated (s).
 ONCE = 30.0
@@ -131,7 +131,7 @@ def linear_solve(body: problems.Body, degree: int, kind: str = "direct") -> Row:
 
     Args:
         body: The body.
-        degree: Of the displacement.
+        degree: Polynomial degree of the displacement.
         kind: "direct": MUMPS' Cholesky factorisation, half the operations of LU; "multigrid":
             conjugate gradients with GAMG, to `TOLERANCE`.
     """
@@ -150,9 +150,9 @@ def solve_once(
 
     Args:
         u: Displacement.
-        residual: F.
-        bcs: Conditions.
-        kind: See `linear_solve`.
+        residual: Residual form F.
+        bcs: Dirichlet conditions.
+        kind: "direct" or "multigrid", as in `linear_solve`.
     """
     bilinear = fem.form(ufl.derivative(residual, u))
     matrix = fem.petsc.assemble_matrix(bilinear, bcs)
@@ -189,7 +189,7 @@ def newton(
     """Solve a form by Newton's method, from the present u. Collective.
 
     Args:
-        F: Residual.
+        F: Residual form.
         u: Displacement.
         bcs: Dirichlet conditions, which u satisfies unless ``lift``.
         size: Norm of the forces; the residual is reduced to `TOLERANCE` of it.
@@ -245,7 +245,7 @@ def newton(
 
 
 def _configure(solver: PETSc.KSP | PETSc.SNES, prefix: str, options: Mapping[str, Any]) -> None:
-    """Set options of a solver; options of the command line with the prefix take precedence."""
+    """Set options of a solver; command-line options with the prefix take precedence."""
     database = PETSc.Options(prefix)
     mine = {name: value for name, value in options.items() if not database.hasName(name)}
     for name, value in mine.items():
@@ -265,9 +265,9 @@ def runs(
 
     Args:
         case: The problem.
-        frictions: Coefficients.
+        frictions: Friction coefficients.
         histories: Numbers of increments of the runs with friction.
-        all_unknowns: Whether several increments are solved on all dofs, too, which takes minutes.
+        all_unknowns: Whether several increments are also solved on all dofs, which takes minutes.
     """
     found: dict[str, Callable[[], Row]] = {YARDSTICK: case.linear}
     variants: dict[str, dict[str, Any]] = {
@@ -318,7 +318,7 @@ def study(
         arguments: Parsed options of `parser`.
     """
     everything: list[Row] = []
-    waits: dict[str, float] = {}  # first runs, on the smallest mesh
+    waits: dict[str, float] = {}  # of first runs on the smallest mesh
     for size, make in cases.items():
         case = make()
         only = arguments.only

@@ -1,6 +1,6 @@
-"""Penalty, augmented Lagrangian and Nitsche's method: error and time.
+"""Compare error and time of penalty, augmented Lagrangian and Nitsche's method.
 
-Problems: the half-cylinder of ``demos/hertz.py`` without friction and with μ = 0.2 in one
+The problems are the half-cylinder of ``demos/hertz.py`` without friction and with μ = 0.2 in one
 increment, and the GRECO block, both with quadratic cells. Errors are relative to this package's
 augmented Lagrangian solution on cells of half the size; the pressure error is the L² norm on Γc.
 Nitsche's method is a hand-written UFL form with Newton's method in DOLFINx, each step factored by
@@ -94,10 +94,11 @@ class NewtonFailed(RuntimeError):
 
 
 def by_nitsche(body: Body, factor: float, share: float) -> Found:
-    """Solve by Nitsche's method for frictional contact (Chouly, Hild), γ = kE/h.
+    """Solve by Nitsche's method for frictional contact (Chouly, Hild), γ = ``factor`` E/h.
 
-    ∫ σ(u):ε(v) - θ ∫ σ(u)n·σ(v)n/γ + ∫ P(σ(u)n - γ jump)·(θ σ(v)n/γ - v) over Γc, P the projection
-    onto pressures and tractions within the cone; θ = ``share``, 1: symmetric without friction.
+    ∫ σ(u):ε(v) - θ ∫ σ(u)n·σ(v)n/γ + ∫ P(σ(u)n - γ jump)·(θ σ(v)n/γ - v) over Γc, where
+    P projects onto pressures and tractions within the friction cone; θ = ``share``, and θ = 1 is
+    symmetric without friction.
     """
     u, F, load, bcs = problems.parts(body, 2)
     load.value = body.end
@@ -180,7 +181,7 @@ def methods(make: Callable[[], Body]) -> dict[str, Callable[[], Found]]:
 def compare(
     name: str, make: Callable[[Any], Body], size: float, finer: float, folder: Path, repeat: int
 ) -> None:
-    """Write the table of one problem."""
+    """Solve one problem by all methods, and write its table."""
     reference = by_package(make(finer), 10.0, "augmented", tolerance=1e-8)
     coarse: Any = {"GRECO": 8}.get(name.split()[0], 0.5)
 
@@ -205,7 +206,7 @@ def compare(
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the benchmark and write its results."""
     parser = timing.parser(__doc__, "enforcement")
     parser.add_argument("--h", type=float, default=0.02, help="cell size of the half-cylinder")
     parser.add_argument("--cells", type=int, default=64, help="cells per side of the block")

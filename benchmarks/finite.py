@@ -1,4 +1,4 @@
-"""Newton iterations at large strains, with contact and for the bulk alone.
+"""Count Newton iterations at large strains, with contact and for the bulk alone.
 
     python benchmarks/finite.py
 
@@ -7,8 +7,8 @@ in by 3, rotated by 0.8 and slid by 2 (demos/rolling.py); and a rubber block tha
 another one and slid along it by four fifths of its length (scenes/rubbed.py). Each history is
 solved three times: with contact; without contact, with the computed displacements of Γc (and of the
 opposing surface) as Dirichlet conditions, by the same solver in the same increments; and the latter
-by SNES on the form in plain DOLFINx. All have the same solutions; the last two give the cost of the
-bulk: Newton iterations, factorisations, and CPU time of all increments (median of ``--repeat``).
+by SNES on the form in plain DOLFINx. All have the same solutions; the last two measure the bulk:
+Newton iterations, factorisations, and CPU time of all increments (median of ``--repeat``).
 
 Newton iterations are given relative to both. The package needs fewer for the bulk: it follows
 prescribed values by a step with the last factored tangent before Newton's method starts; in plain
@@ -46,7 +46,7 @@ PATH = (
 
 
 class UnderADisc:
-    """A rubber block under a disc.
+    """A neo-Hookean rubber block under a rigid disc.
 
     Attributes:
         path: Positions of the disc, one per increment.
@@ -67,7 +67,7 @@ class UnderADisc:
     free = LEFT
 
     def __init__(self, friction: float, fine: int) -> None:
-        """Create it with ``fine`` cells per unit of length."""
+        """Create the block with ``fine`` cells per unit of length."""
         mesh, self.tags = block_mesh("quadrilateral", n=(16 * fine, 10 * fine), size=(16.0, 10.0))
         mesh.geometry.x[:, 0] -= 8
         self.u = fem.Function(fem.functionspace(mesh, ("Lagrange", 2, (2,))))
@@ -86,7 +86,7 @@ class UnderADisc:
         self.contact = fc.Contact(self.u, surface, disc, law, kinematics="finite")
 
     def lead(self, side: float, depth: float, turn: float) -> None:
-        """Move the disc."""
+        """Move the disc sideways and down, and rotate it."""
         self._shift.value[:], self._angle.value = (side, -depth), turn
 
 
@@ -160,7 +160,7 @@ def plain(made: UnderADisc | OneOnAnother, states: Sequence[Array]) -> timing.Ro
 
 
 def check(u: fem.Function, state: Array) -> None:
-    """Assert that u is the state with contact; residuals are 1e-9 of the largest force."""
+    """Assert that u is the state with contact to 1e-5; residuals are 1e-9 of the largest force."""
     size = np.abs(state).max(initial=0.0)
     assert np.abs(u.x.array - state).max(initial=0.0) < 1e-5 * size
 
@@ -184,7 +184,7 @@ def counted(
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the benchmark and write its results."""
     arguments = timing.parser(__doc__, "finite").parse_args()
     fine = 1 if arguments.short else 2
     rows = []

@@ -1,11 +1,11 @@
-"""Half-cylinder on a rigid plane: cost relative to one linear solve.
+"""Measure the cost of a half-cylinder on a rigid plane relative to one linear solve.
 
-The problem of ``demos/hertz.py``, without and with friction, in one increment and in 40. Compared
-are this package with its defaults, with static condensation and L-BFGS, and on all dofs; a
+The problem is that of ``demos/hertz.py``, without and with friction, in one increment and in 40.
+Compared are this package with its defaults, with static condensation and L-BFGS, and on all dofs; a
 hand-written penalty form in DOLFINx with Newton's method and MUMPS' LU; and one linear solve of the
-same body tied to the plane. Meshing is not included, the compilation of forms is separate. Errors
-are relative to the independent solution of the demo (exact complementarity); with friction in one
-increment, to this package's augmented Lagrangian solution on a finer mesh.
+same body tied to the plane. Meshing is not included, and the compilation of forms is timed
+separately. Errors are relative to the independent solution of the demo (exact complementarity);
+with friction in one increment, to this package's augmented Lagrangian solution on a finer mesh.
 
     OMP_NUM_THREADS=1 python benchmarks/half_cylinder.py
     OMP_NUM_THREADS=1 python benchmarks/half_cylinder.py --short
@@ -23,13 +23,13 @@ from benchmarks import costs
 from scenes import problems
 from scenes.problems import hertz
 
-# Fewest increments that are compared with the reference.
+# Fewest increments that are compared with the independent solution.
 MANY = 40
 
 
 @cache
 def one_increment(friction: float, h: float) -> dict[str, float]:
-    """Return the augmented Lagrangian solution of one increment, quadratic cells of size h."""
+    """Return the augmented Lagrangian solution of one increment on quadratic cells of size h."""
     body = problems.half_cylinder(friction, h)
     choices = {"enforcement": "augmented", "tolerance": 1e-7}
     problem, contact, u, load = problems.problem(body, 2, 10.0, choices=choices)
@@ -54,7 +54,7 @@ def errors(finer: float, friction: float, steps: int, results: costs.Row) -> cos
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the benchmark and write its results."""
     parser = costs.parser(__doc__, "half_cylinder")
     parser.add_argument(
         "--h",

@@ -1,18 +1,19 @@
-r"""Ball on a block in 3D, from 32 thousand to a million dofs: time and memory.
+r"""Measure time and memory of a ball on a block in 3D, from 32 thousand to a million dofs.
 
-The problem of ``ball.py`` in one increment, each run in a new process, so that peak memory is its
-own: one linear solve of the same body by multigrid, and this package with its defaults. ``--runs``
-selects others: the linear solve by factorisation, this package with other options, and a
-hand-written Newton method in DOLFINx. Residuals are below 1e-9 of the forces; the linear solves of
-the hand-written method use PETSc's default of 1e-5. Meshing and compilation are not included.
+The problem is that of ``ball.py`` in one increment. Each run is a new process, whose peak memory is
+measured. The runs are one linear solve of the same body by multigrid, and this package with its
+defaults. ``--runs`` selects others: the linear solve by factorisation, this package with other
+options, and a hand-written Newton method in DOLFINx. Residuals are below 1e-9 of the forces; the
+linear solves of the hand-written method use PETSc's default of 1e-5. Meshing and compilation are
+not included.
 
     OMP_NUM_THREADS=1 python benchmarks/large.py              # seven minutes
     OMP_NUM_THREADS=1 python benchmarks/large.py --cells 69   # a million dofs only: five
     OMP_NUM_THREADS=1 python benchmarks/large.py --cells 47 --ranks 1 2
 
-The force is compared with that of the finest mesh, and with Hertz's F = 4/3 E* √R d^{3/2} for a
+The force is compared with that on the finest mesh, and with Hertz's F = 4/3 E* √R d^{3/2} for a
 frictionless half-space: the block is ten contact radii wide and constrained there, which stiffens
-it by about a/L, and friction by 2 %. "messages", "MB sent" and "reductions" are PETSc's counts of
+it by about a/L; friction adds 2 %. "messages", "MB sent" and "reductions" are PETSc's counts of
 one rank (the largest) during the solution; ``parallel.py`` uses them in a model of the cost.
 """
 
@@ -41,9 +42,9 @@ FACTOR = 10.0  # k_n h/E = k_t h/E
 YARDSTICK = "linear, multigrid"
 DEFAULT = (YARDSTICK, "contact")
 CELLS = {31_944: 21, 107_811: 32, 331_776: 47, 1_029_000: 69}
-# Most dofs for factorisations; more take minutes, or do not fit into memory.
+# Most dofs that are factored; more take minutes, or do not fit into memory.
 MANY = 150_000
-# Operations of a solution, by PETSc's names of events.
+# Operations of a solution, and PETSc's events for each.
 EVENTS = {
     "products with matrices": ("MatMult", "MatMultAdd", "MatMultTranspose"),
     "smoothing": ("MatSOR",),
@@ -83,7 +84,7 @@ RUNS: dict[str, Run] = {
 FACTORED = ("linear, direct", "contact, condensed", "by hand, LU")
 
 
-# ---- one process for each ------------------------------------------------------------------------
+# ---- one process per run -------------------------------------------------------------------------
 
 
 def child(run: str, cells: int, repeat: int) -> None:
@@ -155,7 +156,7 @@ def in_units(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the benchmark and write its results."""
     parser = timing.parser(__doc__, "large")
     parser.add_argument("--cells", type=int, nargs="*", help=f"per edge; default {CELLS}")
     parser.add_argument("--ranks", type=int, nargs="*", default=[1])
@@ -183,7 +184,7 @@ def main() -> None:
     finest = [row["force"] for row in rows if "force" in row]
     for row in rows:
         if "force" in row:
-            # A quarter is modelled.
+            # A quarter of the problem is modelled.
             row["force/finest - 1"] = row["force"] / finest[-1] - 1
             row["force/Hertz - 1"] = 4 * row["force"] / problems.hertz_force() - 1
     title = f"Ball on a block, hexahedra, μ = {FRICTION:g}, k h/E = {FACTOR:g}"

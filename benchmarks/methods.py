@@ -1,15 +1,14 @@
-"""The five methods on five scenes with friction: iterations, factorisations and time.
+"""Compare iterations, factorisations and time of five methods on five frictional problems.
 
     python benchmarks/methods.py
 
-Scenes: the half-cylinder of the demo (μ = 0.2, ten increments), the cylinder dragged over a block
-(μ = 0.3, ten increments), and in space a ball pressed into a block and dragged (μ = 0.3, five
-increments), each at moderate and at high contact stiffness; and with finite kinematics a linear
-elastic block dragged over a slab (μ = 0.3, twenty increments), in the plane and in space, by the
-methods that may be had there, at two moderate stiffnesses. Without the fallback: a method that
-fails is seen to fail, at the increment that is given. Writes a table in Markdown and a CSV; times
-are of the solves alone, medians of ``--repeat`` runs (of one, beyond five seconds), without what is
-compiled once.
+The problems are the half-cylinder of the demo (μ = 0.2, ten increments), a cylinder dragged over a
+block (μ = 0.3, ten increments) and, in 3D, a ball pressed into a block and dragged (μ = 0.3, five
+increments), each at moderate and at high contact stiffness; and, with finite kinematics, a linear
+elastic block dragged over a slab (μ = 0.3, twenty increments) in 2D and in 3D, at two moderate
+stiffnesses, by the methods that support finite kinematics. There is no fallback: for a method that
+fails, the table states the increment. It is printed in Markdown and written as CSV. Times are those
+of the solution, medians of ``--repeat`` runs (of one run above five seconds), without compilation.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ Loading = tuple[fc.ContactProblem, Callable[[float], None], int]
 
 
 def half_cylinder(method: str, stiffness: float) -> Loading:
-    """The paper's first example, quadratic triangles."""
+    """Create the half-cylinder, the paper's first example, with quadratic triangles."""
     body = problems.half_cylinder(0.2, 0.1)
     problem, _, _, pressure = problems.problem(body, 2, stiffness, method=method, fallback=False)
 
@@ -52,7 +51,7 @@ def half_cylinder(method: str, stiffness: float) -> Loading:
 
 
 def dragged_cylinder(method: str, stiffness: float) -> Loading:
-    """The ironing demo's scene; the cylinder is moved down by what its force made of it there."""
+    """Create the problem of demos/ironing.py with the indentation prescribed, not the force."""
     mesh, tags = ironing.make_mesh(6)
     u = fem.Function(displacement_space(mesh, 2))
     body = fc.elasticity.LinearElastic(u, ironing.E, ironing.NU, "plane strain")
@@ -69,7 +68,7 @@ def dragged_cylinder(method: str, stiffness: float) -> Loading:
 
 
 def dragged_ball(method: str, stiffness: float) -> Loading:
-    """A ball on a block of hexahedra, linear displacements."""
+    """Create a ball on a block of hexahedra with linear displacements."""
     mesh = dolfinx.mesh.create_box(
         MPI.COMM_WORLD, [[-1, -1, -1], [1, 1, 0]], (16, 16, 8), dolfinx.mesh.CellType.hexahedron
     )
@@ -95,7 +94,7 @@ def dragged(
     law: fc.Coulomb,
     method: str,
 ) -> fc.ContactProblem:
-    """A body clamped at one end, its other one touched by an obstacle."""
+    """Create the problem of a body clamped at one end and touched by an obstacle at the other."""
     u, (held, touched) = body.u, ends
     bcs = [hold(u, tags, held, i) for i in range(len(u))]
     contact = fc.Contact(u, fc.ContactSurface(u.function_space.mesh, tags, touched), obstacle, law)
@@ -106,8 +105,8 @@ def dragged(
 def dragged_block(
     method: str | None, stiffness: float, *, d: int = 2, fallback: bool = False
 ) -> Loading:
-    """A block 0.5 wide pressed into a slab 1 wide and dragged by a quarter, not to its end."""
-    n, m = ((24, 13), (12, 7))[d - 2]  # no two nodes of the two are at one place
+    """Create a block 0.5 wide, pressed into a slab 1 wide and dragged by 0.25, within its ends."""
+    n, m = ((24, 13), (12, 7))[d - 2]  # nodes of block and slab do not coincide
     across = [np.linspace(0, 1, n + 1)] * (d - 1), [np.linspace(0.1, 0.6, m + 1)] * (d - 1)
     upright = np.linspace(0, 0.5, n // 2 + 1), np.linspace(0.5, 1, m + 1)
     floor, lower, upper, top = 1, 2, 3, 4
@@ -144,7 +143,7 @@ SCENES = {
 
 
 def measure(repeats: int) -> Iterator[dict[str, object]]:
-    """Run all scenes; one row for each method and stiffness."""
+    """Solve all problems, and yield one row for each method and stiffness."""
     for scene, (make, methods, stiffnesses) in SCENES.items():
         for stiffness in stiffnesses:
             for method in methods:
@@ -175,7 +174,7 @@ def measure(repeats: int) -> Iterator[dict[str, object]]:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the benchmark and write its results."""
     parser = timing.parser(__doc__, "methods")
     arguments = parser.parse_args()
     rows = []

@@ -1,14 +1,14 @@
-"""L-BFGS against Newton's method with nonlinear bulks: rubber, with a pressure too, and J2 flow.
+"""Compare L-BFGS and Newton's method for nonlinear bulks: rubber, mixed rubber, J2 plasticity.
 
     python benchmarks/nonlinear.py
 
-A block 2 x 1 of quadratic triangles, its bottom held, under a disc of radius 0.8 that is pressed in
-and then dragged with friction (μ = 0.3), ten increments: neo-Hookean (ν = 0.3, pressed by 0.15);
-the same with ν = 0.4999 and a pressure beside the displacement; and J2 plasticity at small strains
-with linear hardening, E/100, whose plastic strains the run keeps (pressed by 0.02, which is far
-beyond a yield stress of E/500). At a contact stiffness of 10 and of 1000 E/h, without the
-fallback and without cuts: a method that fails is seen to fail. Times are of all increments, medians
-of ``--repeat`` runs, without what is compiled once.
+A block 2 x 1 of quadratic triangles, clamped at its bottom, is under a disc of radius 0.8 that is
+pressed in and then dragged with friction (μ = 0.3), in ten increments. Materials are neo-Hookean
+rubber (ν = 0.3, indentation 0.15); the same with ν = 0.4999 and the pressure as an unknown; and J2
+plasticity at small strains with linear hardening E/100 (indentation 0.02, far beyond a yield stress
+of E/500), whose plastic strains are updated after each increment. The contact stiffness is 10 and
+1000 E/h. There is neither fallback nor cut increment, so that failures of a method are recorded.
+Times are those of all increments, medians of ``--repeat`` runs, without compilation.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ Made = tuple[Rubber, float, Callable[[], None]]
 
 
 def hyperelastic(n: int) -> Made:
-    """Compressible rubber."""
+    """Create a block of compressible rubber."""
     return rubber("triangle", n=(2 * n, n), E=E), 0.15, lambda: None
 
 
 def with_pressure(n: int) -> Made:
-    """Rubber that hardly changes its volume."""
+    """Create a block of nearly incompressible rubber, with the pressure as an unknown."""
     scene = rubber("triangle", n=(2 * n, n), E=E, nu=0.4999, mixed="Taylor-Hood")
     return scene, 0.15, lambda: None
 
 
 def plastic(n: int) -> Made:
-    """J2 plasticity in plane strain, radial return at the points of the rule of degree 2."""
+    """Create a block with J2 plasticity in plane strain, radial return at points of degree 2."""
     scene = rubber("triangle", n=(2 * n, n), E=E, linear=True)
     u, space = scene.u, scene.u.function_space
     shear, bulk, hardening, strength = E / 2.6, E / 1.2, E / 100, E / 500
@@ -84,7 +84,7 @@ SCENES = {"neo-Hookean": hyperelastic, "with pressure": with_pressure, "J2": pla
 
 
 def run(make: Callable[[int], Made], stiffness: float, method: str, n: int) -> timing.Row:
-    """One history."""
+    """Solve one load history, and return its row."""
     scene, depth, keep = make(n)
     shift = fem.Constant(scene.mesh, np.zeros(2))
     k = fc.RelativeStiffness(stiffness)
@@ -113,7 +113,7 @@ def run(make: Callable[[int], Made], stiffness: float, method: str, n: int) -> t
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the benchmark and write its results."""
     arguments = timing.parser(__doc__, "nonlinear").parse_args()
     n, stiffnesses = (6, STIFFNESSES[:1]) if arguments.short else (24, STIFFNESSES)
     rows = []

@@ -1,4 +1,4 @@
-"""The page of the benchmarks and its figures, from the CSV files that the benchmarks wrote."""
+"""Write the page of the benchmarks and its figures from the CSV files of the benchmarks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from verification import report
 
 Rows = Sequence[Mapping[str, str]]
 STAMP = "stamp.json"
-# Runs in the figure of cost by size: problem, and the runs of it.
+# Runs in the figure of cost over size, by problem.
 SIZES = {
     "half_cylinder": (
         "one linear solve",
@@ -69,7 +69,7 @@ def write(folder: Path, page: Path) -> None:
 
 
 def _targets(folder: Path, met: Sequence[timing.Row]) -> list[str]:
-    """Return the targets, missed ones first, and the machine."""
+    """Return the lines on the targets, missed ones first, and on the machine."""
     missed, reached, missing = (
         [row for row in met if row["met"] == answer]
         for answer in ("no", "yes", targets.NOT_MEASURED)
@@ -105,7 +105,7 @@ def _failed(stamp: Path) -> bool:
 
 
 def _cost(folder: Path) -> list[str]:
-    """Return the cost of contact relative to one linear solve."""
+    """Return the section on the cost of contact relative to one linear solve."""
     tables = {name: report.read(folder / name / f"{name}_sizes.csv") for name in SIZES}
     draw_cost(folder / "cost.png", tables)
     lines = ["## Cost of contact", "", "![Time over dofs](benchmarks/cost.png)", ""]
@@ -139,7 +139,7 @@ def _cost(folder: Path) -> list[str]:
 
 
 def _large(folder: Path) -> list[str]:
-    """Return the largest problems."""
+    """Return the section on the largest problems."""
     rows = report.read(folder / "large/large.csv")
     runs = {row["dofs"]: row for row in rows if row["run"] == "contact"}
     ratios = ", ".join(report.number(row["linear solves (multigrid)"]) for row in runs.values())
@@ -157,7 +157,7 @@ def _large(folder: Path) -> list[str]:
 
 
 def _ranks(folder: Path) -> list[str]:
-    """Return the half-cylinder on two ranks."""
+    """Return the section on the half-cylinder on two ranks."""
     rows = report.read(folder / "ranks/ranks.csv")
     two = [row for row in rows if row["ranks"] == "2"]
     gains = "; ".join(f"{row['run']} {report.number(row['speed-up'])}" for row in two)
@@ -172,7 +172,7 @@ def _ranks(folder: Path) -> list[str]:
 
 
 def _parallel(folder: Path) -> list[str]:
-    """Return two ranks with multigrid, and the model of the cost."""
+    """Return the section on two ranks with multigrid, and on the model of the cost."""
     rows = report.read(folder / "parallel/parallel_1.csv")
     largest = max(rows, key=lambda row: int(row["dofs"]))["dofs"]
     gains = "; ".join(
@@ -204,7 +204,7 @@ def _parallel(folder: Path) -> list[str]:
 
 
 def _accuracy(folder: Path) -> list[str]:
-    """Return enforcement, quadrature and adaptive refinement."""
+    """Return the section on enforcement, quadrature and adaptive refinement."""
     draw_accuracy(folder / "accuracy.png", folder)
     return [
         "## Accuracy",
@@ -233,7 +233,7 @@ def _accuracy(folder: Path) -> list[str]:
 
 
 def draw_targets(path: Path, rows: Sequence[timing.Row]) -> None:
-    """Draw measured values relative to their targets."""
+    """Plot measured values relative to their targets."""
     ratios = []
     for row in rows:
         sign, limit = row["target"].split()
@@ -256,7 +256,7 @@ def draw_targets(path: Path, rows: Sequence[timing.Row]) -> None:
 
 
 def draw_cost(path: Path, tables: Mapping[str, Rows]) -> None:
-    """Draw time over dofs with fitted power laws."""
+    """Plot time over dofs with fitted power laws."""
     with plotting.figure(path, len(SIZES), size=(5.0, 4.4)) as all_axes:
         for axes, (name, runs) in zip(all_axes, SIZES.items(), strict=True):
             for run, style in zip(runs, ("k.--", "C0o-", "C1s-", "C3v-", "C4^-"), strict=False):
@@ -272,7 +272,7 @@ def draw_cost(path: Path, tables: Mapping[str, Rows]) -> None:
 
 
 def draw_accuracy(path: Path, folder: Path) -> None:
-    """Draw errors by enforcement, quadrature and refinement."""
+    """Plot errors by enforcement, quadrature and refinement."""
     enforcement = report.read(folder / "enforcement/half-cylinder_mu__02.csv")
     quadrature = report.read(folder / "quadrature/degree_2.csv")
     refinement = report.read(folder / "adaptation/adaptation.csv")
@@ -322,7 +322,7 @@ def _refinement(row: Mapping[str, str]) -> str:
 def _draw_groups(
     axes: Any, rows: Rows, group: Callable[[Mapping[str, str]], str], x: str, y: str
 ) -> None:
-    """Draw a line for each group of rows; rows of the group "" are left out."""
+    """Plot a line for each group of rows, and omit rows of the group ""."""
     names = [name for name in dict.fromkeys(group(row) for row in rows) if name]
     for number, name in enumerate(names):
         mine = [row for row in rows if group(row) == name and row[y] != ""]

@@ -1,13 +1,13 @@
-r"""Two ranks compared with one, and a model of the cost fitted to them.
+r"""Compare two ranks with one, and fit a model of the cost.
 
-The ball on a block of ``large.py`` in several sizes, solved by multigrid on one and on two ranks:
+The ball on a block of ``large.py`` is solved by multigrid in several sizes on one and on two ranks:
 one linear solve, and contact with friction in one increment by L-BFGS and by Newton's method. The
-cost of a message, a reduction and a byte between two processes of this machine is measured
+cost of a message, a reduction and a byte between two processes of the same machine is measured
 separately, and so is the memory bandwidth per rank when both ranks copy at once. The model is
 
     T = c n/p + m (α + s/(m β)) + r γ log₂ p
 
-for each iteration, on p ranks and with n dofs: c is fitted to the times on one rank; m, s and r,
+for each iteration on p ranks with n dofs: c is fitted to the times on one rank; m, s and r,
 the messages, bytes and reductions of a rank, are counted by PETSc.
 
     OMP_NUM_THREADS=1 python benchmarks/parallel.py            # ten minutes
@@ -15,7 +15,7 @@ the messages, bytes and reductions of a rank, are counted by PETSc.
     python benchmarks/parallel.py --tables       # from stored measurements
 
 Two tables extrapolate from 1 to 1,024 ranks and from 1e5 to 1e9 dofs: contact by multigrid, and the
-interface of the ranks with static condensation. Another table has the time by operation.
+interface of the ranks with static condensation. Another table lists the time by operation.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from verification import report
 
 RUNS = ("linear, multigrid", "contact, multigrid", "contact, multigrid, Newton")
 CELLS = (24, 32, 47)
-# Neighbours of a subdomain, with many ranks.
+# Neighbours of a subdomain if there are many ranks.
 NEIGHBOURS = 6
 Row = timing.Row
 
@@ -68,8 +68,8 @@ NETWORKS = {
 }
 
 
-# Of the extrapolated tables: dofs, ranks, memory of a rank (GiB), fewest dofs of a rank, and the
-# longest elimination of an interface (s).
+# Extrapolated tables: dofs and ranks; memory per rank (GiB), fewest dofs per rank, and longest
+# elimination of an interface (s) that is listed.
 SIZES = (1e5, 1e6, 1e7, 1e8, 1e9)
 RANKS = (1, 4, 16, 64, 256, 1024)
 NODE, FEWEST, BEARABLE = 16.0, 5000, 600.0
@@ -79,7 +79,7 @@ NODE, FEWEST, BEARABLE = 16.0, 5000, 600.0
 
 
 def fit_message(sizes: Sequence[float], times: Sequence[float]) -> tuple[float, float]:
-    """α and β of T = α + s/β, by least squares of the relative differences.
+    """Fit α and β of T = α + s/β by least squares of the relative differences.
 
     Args:
         sizes: Bytes.
@@ -92,7 +92,7 @@ def fit_message(sizes: Sequence[float], times: Sequence[float]) -> tuple[float, 
 
 
 def measure_machine() -> Machine:
-    """Measure the constants on two ranks. Collective."""
+    """Measure the constants of the model on two ranks. Collective."""
     comm = MPI.COMM_WORLD
     other = 1 - comm.rank
     sizes, times = [8 * 4**k for k in range(10)], []
@@ -115,7 +115,7 @@ def measure_machine() -> Machine:
         start = time.perf_counter()
         comm.Allreduce(one, sums)
         waits.append(time.perf_counter() - start)
-    # Copies of one rank after the other, then of both at once.
+    # Memory copies on one rank after the other, then on both at once.
     a, b = np.zeros(10_000_000), np.ones(10_000_000)
     alone = together = 0.0
     for turn in range(2):
@@ -271,7 +271,7 @@ def by_multigrid(rows: Sequence[Row], c: float, machine: Machine) -> list[Row]:
     iterations = max(row["iterations"] for row in rows)
     memory = min(
         row["GiB"] / row["dofs"] for row in rows
-    )  # of the largest problem, least affected by libraries
+    )  # reached by the largest problem, where libraries matter least
     found = []
     for dofs in SIZES:
         row: Row = {"dofs": f"{dofs:.0e}"}
@@ -304,7 +304,7 @@ def interfaces() -> list[Row]:
 
 
 def draw(path: Path, rows: Sequence[Row], machine: Machine) -> None:
-    """Draw the speed-up of the model over the ranks, with the measured ones."""
+    """Plot the modelled and the measured speed-up over the number of ranks."""
     mine = [row for row in rows if row["run"] == RUNS[1]]
     c = fit_operations(mine)
     ranks = 2 ** np.arange(0, 11)
@@ -324,7 +324,7 @@ def draw(path: Path, rows: Sequence[Row], machine: Machine) -> None:
 
 
 def measured(path: Path) -> list[Row]:
-    """Read stored rows, with numbers converted."""
+    """Read stored rows, and convert numbers."""
 
     def value(text: str) -> float | int | str:
         for kind in (int, float):
@@ -393,7 +393,7 @@ def write_tables(folder: Path, rows: list[Row], machine: Machine) -> None:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the benchmark and write its results."""
     parser = timing.parser(__doc__, "parallel")
     parser.add_argument("--cells", type=int, nargs="*", default=list(CELLS))
     parser.add_argument("--machine", action="store_true", help=argparse.SUPPRESS)

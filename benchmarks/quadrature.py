@@ -1,11 +1,11 @@
-"""Quadrature on Γc: error and oscillation of the pressure by degree and scheme.
+"""Measure error and oscillation of the pressure by degree and scheme of the quadrature on Γc.
 
-Half-cylinder of ``demos/hertz.py`` without friction, linear and quadratic displacements (degree p);
-2 to p + 2 Gauss points per edge (quadrature degree 3 to 2p + 3; the default, 2p, has p + 1 points),
-and vertex quadrature; penalty of 10 and 1000 E/h, and augmented Lagrangian. The reference is the
-augmented Lagrangian solution with quadratic cells of a quarter of the smallest size. Two measures
-of the pressure: its L² error, and its largest error for x < 0.85 a, where the pressure is smooth,
-called oscillation.
+The half-cylinder of ``demos/hertz.py`` without friction is solved with linear and quadratic
+displacements (degree p); with 2 to p + 2 Gauss points per edge (quadrature degree 3 to 2p + 3; the
+default, 2p, has p + 1 points) and vertex quadrature; and with a penalty of 10 and 1000 E/h and the
+augmented Lagrangian. The reference is the augmented Lagrangian solution with quadratic cells of a
+quarter of the smallest size. Two errors of the pressure are measured: its L² error, and its largest
+error for x < 0.85 a, where the pressure is smooth, called oscillation.
 
     OMP_NUM_THREADS=1 python benchmarks/quadrature.py
 """
@@ -27,7 +27,7 @@ ENFORCEMENTS: dict[str, tuple[float, str]] = {
     "penalty 1000": (1000.0, "penalty"),
     "augmented 10": (10.0, "augmented"),
 }
-MIDDLE = 0.85 * 2.127  # a of the independent solution
+MIDDLE = 0.85 * 2.127  # half-width a of the independent solution
 
 
 def solve(
@@ -81,7 +81,7 @@ def study(degree: int, sizes: list[float], folder: Path) -> None:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the benchmark and write its results."""
     arguments = timing.parser(__doc__, "quadrature").parse_args()
     if MPI.COMM_WORLD.size > 1:
         raise SystemExit("runs on one rank")

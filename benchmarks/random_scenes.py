@@ -1,16 +1,16 @@
-"""The default against every method without fallback, on random scenes.
+"""Compare the default with every method without fallback on random scenes.
 
     python benchmarks/random_scenes.py               # 600 scenes
     python benchmarks/random_scenes.py --short       # 8 of each
     python benchmarks/random_scenes.py --only small  # one kind
 
-The scenes are those of ``verification/``: small displacements without cuts, some of them with more
-cells and with stiffer contact, and with finite kinematics, on rigid obstacles and between two
-bodies, with one cut. Nothing is said of the method, the condensation or the linear solver. An
-increment counts if the verification accepts it; a scene is complete if all its increments are. The
-table has the complete scenes of every method, the iterations of those, and processor time; the CSV
-has a row for every scene and method. Requirement: the default completes at least as many scenes as
-the best single method, in at most 1.1 of its iterations on the scenes that both complete.
+The scenes are those of ``verification/``: small displacements without cut increments, some with
+more cells and with stiffer contact; and finite kinematics on rigid obstacles and between two
+bodies, with one cut. They do not prescribe method, condensation or linear solver. A scene is
+complete if all its increments are verified. The table has the complete scenes of every method,
+their iterations, and CPU time; the CSV has a row for every scene and method. Requirement: the
+default completes at least as many scenes as the best single method, in at most 1.1 of its
+iterations on the scenes that both complete.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from benchmarks import timing
 from verification import finite_scenes, fuzz_scenes, fuzz_setup, sliding_scenes
 
 Scene = dict[str, Any]
-# What scenes say of the solution is left out, and what the methods alone cannot take.
+# Not drawn: settings of the solution, and features that some methods do not support.
 LEFT_OUT = (
     "far",
     "multipliers",
@@ -41,19 +41,19 @@ LEFT_OUT = (
     "units",
 )
 SAID = ("method", "max_iterations", "restart", "condensation")
-# Scenes of a family share compiled forms.
+# Scenes of a family use the same compiled forms.
 FAMILY = 8
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of scenes.
+    """A kind of random scene.
 
     Attributes:
-        draw: Draws a scene, from its seed and its family.
+        draw: Draws a scene from its seed and its family.
         setup: Creates mesh, contacts and problem.
-        methods: Methods that may be had.
-        scenes: Their number.
+        methods: Methods that support these scenes.
+        scenes: Number of scenes.
         first: First seed.
         cuts: Number of times that an increment may be halved.
     """
@@ -67,12 +67,12 @@ class Kind:
 
 
 def draw_small(seed: int, family: int) -> Scene:
-    """Small displacements."""
+    """Draw a scene with small displacements."""
     return fuzz_scenes.draw(seed, without=(*LEFT_OUT, "increment"), family=family)
 
 
 def draw_fine(seed: int, family: int, stiffer: float = 1.0) -> Scene:
-    """Small displacements, four times the cells along every edge, twice in space."""
+    """Draw a scene of `draw_small` with 4 times (3D: twice) the cells along every edge."""
     scene = draw_small(seed, family)
     for body in scene["bodies"]:
         body["n"] = [n * (4 if len(body["n"]) == 2 else 2) for n in body["n"]]
@@ -86,17 +86,17 @@ def draw_fine(seed: int, family: int, stiffer: float = 1.0) -> Scene:
 
 
 def draw_stiff(seed: int, family: int) -> Scene:
-    """The same, contact of 30 times the stiffness that is drawn, always by E/h."""
+    """Draw a scene of `draw_fine` with 30 times the contact stiffness, in units of E/h."""
     return draw_fine(seed, family, stiffer=30.0)
 
 
 def draw_finite(seed: int, family: int) -> Scene:
-    """Finite kinematics on rigid obstacles."""
+    """Draw a scene with finite kinematics on rigid obstacles."""
     return finite_scenes.draw(seed, family=family)
 
 
 def draw_bodies(seed: int, family: int) -> Scene:
-    """Finite kinematics between two bodies."""
+    """Draw a scene with finite kinematics between two bodies."""
     return sliding_scenes.draw(seed, family=family)
 
 
@@ -112,7 +112,7 @@ KINDS = {
 
 
 def outcomes(name: str, kind: Kind, scenes: int) -> Iterator[timing.Row]:
-    """Solve scenes by the default and by every method alone: a row for each. Collective."""
+    """Yield the row of every scene by the default and by every method alone. Collective."""
     for seed in range(kind.first, kind.first + scenes):
         drawn = kind.draw(seed, seed // FAMILY) | {"cuts": kind.cuts}
         scene = {key: value for key, value in drawn.items() if key not in SAID}
@@ -129,7 +129,7 @@ def outcomes(name: str, kind: Kind, scenes: int) -> Iterator[timing.Row]:
                 outcome = "complete"
             except fc.NotConverged:
                 outcome = "refused"
-            except ValueError:  # refused input, or not for this method
+            except ValueError:  # invalid input, or not supported by the method
                 outcome = "not taken"
             yield {
                 "kind": name,
@@ -142,7 +142,7 @@ def outcomes(name: str, kind: Kind, scenes: int) -> Iterator[timing.Row]:
 
 
 def summary(rows: list[timing.Row]) -> list[timing.Row]:
-    """Return complete scenes and iterations of every kind and method."""
+    """Return the table of complete scenes and iterations by kind and method."""
     table = []
     for kind, method in dict.fromkeys((row["kind"], row["method"]) for row in rows):
         mine = [row for row in rows if (row["kind"], row["method"]) == (kind, method)]
@@ -170,7 +170,7 @@ def summary(rows: list[timing.Row]) -> list[timing.Row]:
 
 
 def main() -> None:
-    """Solve the scenes and write rows and table."""
+    """Solve the scenes, and write rows and table."""
     parser = timing.parser(__doc__, "random_scenes")
     parser.add_argument("--only", choices=KINDS, help="one kind of scenes")
     parser.add_argument("--scenes", type=int, help="number of scenes of each kind")

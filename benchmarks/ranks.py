@@ -1,10 +1,10 @@
-"""Half-cylinder on one rank and on several: speed-up of this package and of plain DOLFINx.
+"""Measure the speed-up of this package and of plain DOLFINx on several ranks.
 
-The problem of ``half_cylinder.py``, without and with friction, in one increment and in 40, by this
-package with its defaults; one linear solve of the same body tied to the plane (MUMPS' Cholesky
-factorisation); and a hand-written penalty form in DOLFINx with Newton's method and MUMPS' LU.
-Meshing and compilation are not included. Times are those of the slowest rank, also in units of one
-linear solve on one rank, and on the same number of ranks.
+Timed are the half-cylinder of ``half_cylinder.py``, without and with friction, in one increment and
+in 40, by this package with its defaults; one linear solve of the same body tied to the plane
+(MUMPS' Cholesky factorisation); and a hand-written penalty form in DOLFINx with Newton's method and
+MUMPS' LU. Meshing and compilation are not included. Times are those of the slowest rank, also in
+units of one linear solve on one rank and on the same number of ranks.
 
     OMP_NUM_THREADS=1 python benchmarks/ranks.py                 # two minutes
     OMP_NUM_THREADS=1 python benchmarks/ranks.py --ranks 1 2 4 --h 0.0115
@@ -85,7 +85,7 @@ def compared(rows: list[Row]) -> list[Row]:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the benchmark and write its results."""
     parser = timing.parser(__doc__, "ranks")
     parser.add_argument("--h", type=float, nargs="*", default=[0.0165], help="cell size on Γc")
     parser.add_argument("--ranks", type=int, nargs="*", default=[1, 2])

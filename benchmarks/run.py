@@ -1,17 +1,17 @@
-"""Run the benchmarks one after another, each in a process of its own, and write their page.
+"""Run the benchmarks one after another, each in a new process, and write their page.
 
     OMP_NUM_THREADS=1 python benchmarks/run.py                     # all: 50 minutes
     OMP_NUM_THREADS=1 python benchmarks/run.py --short             # small problems
-    OMP_NUM_THREADS=1 python benchmarks/run.py half_cylinder ball  # some; other results are kept
+    OMP_NUM_THREADS=1 python benchmarks/run.py half_cylinder ball  # some; other results remain
     OMP_NUM_THREADS=1 python benchmarks/run.py --docs              # writes docs/benchmarks.md
     python benchmarks/run.py --page                                # page of stored results
 
-Every script of this folder takes ``--output``, ``--repeat`` and ``--short`` and writes its numbers
-(``.csv``) into its part of the output folder. ``page.py`` writes the page there, README.md, with
+Every script of this folder takes ``--output``, ``--repeat`` and ``--short``, and writes its CSV
+files into its subfolder of the output folder. ``page.py`` writes the page there, README.md, with
 the figures and the table of targets, from the results of this run and earlier ones. Forms are
 compiled into a new cache, so that first runs include the compilation. The exit code is 1 if a
 benchmark failed. ``methods.py``, ``nonlinear.py`` (five minutes each) and ``trade.py`` (ten
-minutes) have their tables on other pages of docs/ and are run by name only, as are
+minutes) have their tables on other pages of docs/, and run by name only, as do
 ``bolted_joint.py``, which takes longer than ten minutes, ``random_scenes.py`` and ``selection.py``
 (hours).
 """
@@ -33,7 +33,7 @@ from benchmarks import page
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
 HELPERS = ("__init__", "run", "page", "timing", "costs", "targets", "trade_page", "trade_scenes")
-# Long, or with a page of their own in docs/.
+# Long, or described on another page of docs/.
 BY_NAME_ONLY = ("bolted_joint", "methods", "nonlinear", "random_scenes", "selection", "trade")
 
 

@@ -1,17 +1,17 @@
-"""The default against every linear solver and method by hand, on drawn sizes and shapes.
+"""Compare the default selection with every linear solver and method on random problems.
 
     OMP_NUM_THREADS=1 python benchmarks/selection.py               # 60 scenes, hours
     OMP_NUM_THREADS=1 python benchmarks/selection.py --short       # 4 small ones
     OMP_NUM_THREADS=1 python benchmarks/selection.py --start 20 --scenes 10
 
-A scene is drawn by its seed: blocks of simplices (by gmsh, graded towards the contact, or not) or
-of quadrilaterals and hexahedra, one on the other, a rigid ball pressed on the uppermost and then
-moved along; with friction or without, some with a nonlinear bulk, Γc as large as what touches or
-the whole top. Every way runs in a process of its own, after a small problem that compiles its
-forms: time is that of making and solving the problem, memory what the process has grown by in it.
-A way that takes much longer than the default is ended. Requirement: the default takes at most 1.25
-of the time of the best way in 95 % of the scenes and at most twice that in all, and at most twice
-the memory of the least of those within 1.25.
+A scene is drawn from its seed: a stack of blocks of simplices, quadrilaterals or hexahedra, graded
+towards the contact or not; a rigid ball is pressed on the uppermost block and then moved along it.
+Some scenes have friction, some a nonlinear bulk; Γc is the contact zone or the whole top. Each
+configuration of the solver runs in a new process, after a small problem that compiles its forms.
+Measured are the time to create and solve the problem, and the growth of the process's memory up to
+its peak. A configuration that takes much longer than the default is terminated. Requirement: the
+default takes at most 1.25 times the time of the fastest configuration in 95 % of the scenes and at
+most twice that time in all, and at most twice the least memory of the configurations within 1.25.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from verification import report
 COMM = MPI.COMM_WORLD
 BASE, TOP, SIDE = 1, 2, 3
 E, NU, RADIUS, DEPTH = 1000.0, 0.3, 4.0, 0.01
-HALF_WIDTH = (RADIUS * DEPTH) ** 0.5  # of what touches, about
+HALF_WIDTH = (RADIUS * DEPTH) ** 0.5  # of the contact, approximately
 DEFAULT = "default"
 WAYS: dict[str, dict[str, Any]] = {
     DEFAULT: {},
@@ -56,25 +56,26 @@ WAYS: dict[str, dict[str, Any]] = {
     "multigrid, Newton": {"condensation": False, "linear_solver": "multigrid", "method": "newton"},
     "multigrid, L-BFGS": {"condensation": False, "linear_solver": "multigrid", "method": "lbfgs"},
 }
-# A way is ended after this many times the default's time, and not before as many seconds.
+# Time limit of the other configurations: PATIENCE times the default's time, or LEAST if that is
+# larger, plus LEAST (s).
 PATIENCE, LEAST = 4.0, 30.0
-SLOWEST = 1500.0  # of the default (s)
+SLOWEST = 1500.0  # time limit of the default (s)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What is drawn.
+    """Parameters of a random problem.
 
     Attributes:
-        cell: Kind of the cells.
-        graded: Whether they are larger away from the contact.
-        degree: Of the displacement.
-        dofs: About how many.
+        cell: Cell type.
+        graded: Whether cells are larger away from the contact.
+        degree: Polynomial degree of the displacement.
+        dofs: Approximate number of dofs.
         bodies: Number of blocks.
-        height: Of a block, whose width is 1.
-        generous: Whether Γc is the whole top.
-        friction: μ.
-        linear: Whether the bulk is.
+        height: Height of a block, whose width is 1.
+        generous: Whether Γc of the ball is the whole top face.
+        friction: Coefficient μ.
+        linear: Whether the bulk is linear elastic.
         steps: Number of increments.
         ranks: Number of ranks.
     """
@@ -93,7 +94,7 @@ class Scene:
 
 
 def draw(seed: int, fewest: float = 1e3, most: float = 2e5) -> Scene:
-    """Draw a scene."""
+    """Draw a scene from a seed."""
     rng = np.random.default_rng(seed)
     plane = rng.uniform() < 0.4
     cells = ("triangle", "quadrilateral") if plane else ("tetrahedron", "hexahedron")
@@ -116,12 +117,12 @@ def draw(seed: int, fewest: float = 1e3, most: float = 2e5) -> Scene:
 
 
 def block(scene: Scene, number: int, dofs: float) -> tuple[dolfinx.mesh.Mesh, Any, Any]:
-    """Mesh a block, its top at z = -number · height, and tag its sides. Collective."""
+    """Mesh a block whose top is at z = -number · height, and tag its sides. Collective."""
     d = 2 if scene.cell in ("triangle", "quadrilateral") else 3
     high = -number * scene.height
     low = np.array([-0.5] * (d - 1) + [high - scene.height])
     size = np.array([1.0] * (d - 1) + [scene.height])
-    h = scene.degree * (scene.height / (dofs / d)) ** (1 / d)  # of equal cells
+    h = scene.degree * (scene.height / (dofs / d)) ** (1 / d)  # if all cells are equal
     simplices = scene.cell in ("triangle", "tetrahedron")
     if simplices and scene.graded:
         mesh = _by_gmsh(low, size, h)
@@ -129,10 +130,10 @@ def block(scene: Scene, number: int, dofs: float) -> tuple[dolfinx.mesh.Mesh, An
         counts = [max(2, round(s / h)) for s in size]
         make = dolfinx.mesh.create_rectangle if d == 2 else dolfinx.mesh.create_box
         mesh = make(COMM, [low, low + size], counts, CellType[scene.cell])
-        if scene.graded:  # towards the middle of the top
+        if scene.graded:  # refine towards the middle of the top
             x = mesh.geometry.x
             x[:, : d - 1] = 0.5 * np.sign(x[:, : d - 1]) * np.abs(2 * x[:, : d - 1]) ** 1.7
-            below = np.abs(high - x[:, d - 1]) / scene.height  # round-off may lie above
+            below = np.abs(high - x[:, d - 1]) / scene.height  # x may exceed high by round-off
             x[:, d - 1] = high - scene.height * below**1.7
     reach = np.inf if scene.generous or number else 1.5 * (HALF_WIDTH + h)
     where = {
@@ -144,7 +145,7 @@ def block(scene: Scene, number: int, dofs: float) -> tuple[dolfinx.mesh.Mesh, An
 
 
 def _by_gmsh(low: np.ndarray, size: np.ndarray, h: float) -> dolfinx.mesh.Mesh:
-    """Simplices of 0.4 h at the middle of the top to 2.4 h. Collective."""
+    """Mesh a block by simplices of 0.4 h at the middle of the top to 2.4 h. Collective."""
     d = len(low)
     gmsh.initialize()
     try:
@@ -173,7 +174,7 @@ def _by_gmsh(low: np.ndarray, size: np.ndarray, h: float) -> dolfinx.mesh.Mesh:
 
 @dataclass(frozen=True)
 class Made:
-    """Mesh, displacement and conditions; see `make`."""
+    """Mesh, displacement, Dirichlet conditions and loads of a scene, created by `make`."""
 
     u: fem.Function
     joined: fc.JoinedMesh
@@ -183,19 +184,19 @@ class Made:
 
 
 def make(scene: Scene, dofs: float) -> Made:
-    """Make meshes and conditions of a scene, which are not timed. Collective."""
+    """Create meshes and conditions of a scene, which is not timed. Collective."""
     joined = fc.join_meshes([block(scene, n, dofs / scene.bodies) for n in range(scene.bodies)])
     u = fem.Function(displacement_space(joined.mesh, scene.degree))
     d, last = len(u), scene.bodies - 1
     bcs = [hold(u, joined.facets, joined.facet(last, BASE), i) for i in range(d)]
-    for body in range(last):  # friction does not hold them all
+    for body in range(last):  # friction need not constrain them
         bcs += [hold(u, joined.facets, joined.facet(body, SIDE), i) for i in range(d - 1)]
     down, along = (fem.Constant(joined.mesh, 0.0) for _ in range(2))
     return Made(u, joined, bcs, down, along)
 
 
 def solve(scene: Scene, made: Made, options: dict[str, Any]) -> tuple[float, int]:
-    """Solve all increments; the normal force on the ball and the iterations. Collective."""
+    """Solve all increments; return normal force on the ball and iterations. Collective."""
     u, joined, mesh = made.u, made.joined, made.joined.mesh
     d = len(u)
     v = ufl.TestFunction(u.function_space)
@@ -211,7 +212,7 @@ def solve(scene: Scene, made: Made, options: dict[str, Any]) -> tuple[float, int
         surface = fc.ContactSurface(mesh, joined.facets, joined.facet(n, TOP))
         other = fc.DeformableBody(joined.facets, joined.facet(n - 1, BASE))
         contacts.append(fc.Contact(u, surface, other, law, name=f"joint {n}"))
-    # UFL's estimate takes up to 95 times as long for rubber (`bulk_quadrature.py`).
+    # UFL's estimated degree takes up to 95 times as long for rubber (`bulk_quadrature.py`).
     dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 2 * scene.degree + 1})
     problem = fc.ContactProblem(
         body.residual(v, dx=dx), u, bcs=made.bcs, contacts=contacts, **options
@@ -226,11 +227,11 @@ def solve(scene: Scene, made: Made, options: dict[str, Any]) -> tuple[float, int
     return float(contacts[0].resultants().normal_force), iterations
 
 
-# ---- one way, in a process of its own ------------------------------------------------------------
+# ---- one configuration in a new process ----------------------------------------------------------
 
 
 def child(scene: Scene, way: str) -> None:
-    """Solve by one way, and print its row as JSON on rank 0."""
+    """Solve with one configuration, and print its row as JSON on rank 0."""
     logging.disable(logging.WARNING)
     warnings.simplefilter("ignore")
     row: dict[str, Any] = {"outcome": "solved"}
@@ -253,13 +254,13 @@ def child(scene: Scene, way: str) -> None:
 
 
 def _memory(name: str) -> float:
-    """Memory of this process, now (VmRSS) or at most (VmHWM) (GiB)."""
+    """Return the present (VmRSS) or the peak memory (VmHWM) of this process (GiB)."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith(name)).split()[1]) / 2**20
 
 
 def run(scene: Scene, seed: int, way: str, limit: float) -> timing.Row:
-    """Run a way in a process of its own; ended after a time (s)."""
+    """Run a configuration in a new process, which is terminated after ``limit`` (s)."""
     words = ["-m", "benchmarks.selection", "--child", way, json.dumps(asdict(scene))]
     try:
         row = answer(scene.ranks, *words, seconds=limit)
@@ -270,11 +271,11 @@ def run(scene: Scene, seed: int, way: str, limit: float) -> timing.Row:
     return {"seed": seed, "way": way} | row
 
 
-# ---- all -----------------------------------------------------------------------------------------
+# ---- evaluation ----------------------------------------------------------------------------------
 
 
 def regret(rows: list[timing.Row]) -> list[timing.Row]:
-    """Compare the default with the best way of every scene."""
+    """Compare the default with the fastest other configuration of every scene."""
     table = []
     for seed in dict.fromkeys(row["seed"] for row in rows):
         mine = {row["way"]: row for row in rows if row["seed"] == seed}
@@ -304,7 +305,7 @@ def regret(rows: list[timing.Row]) -> list[timing.Row]:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the benchmark and write its results."""
     parser = timing.parser(__doc__, "selection")
     parser.add_argument("--scenes", type=int, default=60)
     parser.add_argument("--start", type=int, default=0, help="first seed")
@@ -329,7 +330,7 @@ def main() -> None:
             if way == DEFAULT:
                 limit = max(LEAST, PATIENCE * row.get("seconds", SLOWEST)) + LEAST
         arguments.output.mkdir(parents=True, exist_ok=True)
-        report.save(arguments.output / "selection.csv", rows)  # what is there is kept
+        report.save(arguments.output / "selection.csv", rows)  # after every scene
     timing.write(arguments.output, "regret", "The default against the best way", regret(rows))
 
 

@@ -1,10 +1,10 @@
-"""Rigid ball on a block with the whole top face as Γc, 3D, with friction.
+"""Measure the cost of a rigid ball on a block in 3D whose whole top face is Γc, with friction.
 
-A cube of linear tetrahedra; the ball is moved down in one increment and in ten. At the end a
-sixteenth of the top face is in contact. Compared are this package with its defaults, a hand-written
-penalty form in DOLFINx with Newton's method and GMRES with GAMG, and one linear solve of the body
-by factorisation and by multigrid. All residuals are below 1e-9 of the forces. Meshing is not
-included, the compilation of forms is separate.
+The block is a cube of linear tetrahedra; the ball is moved down in one increment and in ten. At the
+end a sixteenth of the top face is in contact. Compared are this package with its defaults, a
+hand-written penalty form in DOLFINx with Newton's method and GMRES with GAMG, and one linear solve
+of the body by factorisation and by multigrid. All residuals are below 1e-9 of the forces. Meshing
+is not included, and the compilation of forms is timed separately.
 
     OMP_NUM_THREADS=1 python benchmarks/tagged.py            # four minutes
     OMP_NUM_THREADS=1 python benchmarks/tagged.py --short
@@ -36,7 +36,7 @@ def runs(case: costs.Case, friction: float) -> dict[str, Callable[[], costs.Row]
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the benchmark and write its results."""
     parser = costs.parser(__doc__, "tagged")
     parser.add_argument("--cells", type=int, nargs="+", default=[12, 20, 30], help="cells per side")
     parser.add_argument("--friction", type=float, default=0.3)

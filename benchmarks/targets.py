@@ -26,7 +26,7 @@ class Target:
         measure: Returns the value from its rows, and notes; raises `LookupError` if the run is
             missing.
         limit: The target.
-        above: Whether the limit is a lower one.
+        above: Whether the limit is a lower limit.
     """
 
     problem: str
@@ -109,7 +109,7 @@ def newton_iterations(
 
 
 def worst(ranks: int) -> Callable[[Rows], tuple[float, str]]:
-    """Measure the largest cost of an increment with a solution, in linear solves."""
+    """Measure the largest cost of a solved increment on ``ranks`` ranks, in linear solves."""
 
     def measure(rows: Rows) -> tuple[float, str]:
         mine = [row for row in rows if int(row["ranks"]) == ranks]
@@ -192,5 +192,5 @@ TARGETS: tuple[Target, ...] = tuple(_all())
 
 
 def table(folder: Path, targets: Sequence[Target] = TARGETS) -> list[dict[str, Any]]:
-    """Return all targets with the measurements in a folder."""
+    """Return the rows of all targets with the measurements in a folder."""
     return [target.row(folder) for target in targets]

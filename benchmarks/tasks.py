@@ -1,9 +1,9 @@
-"""CPU time of five scripts of the documentation, each started in an empty folder.
+"""Measure the CPU time of five scripts of the documentation, each run in an empty folder.
 
 Each script is run in a new process, first with empty caches (compiled forms, fonts of Matplotlib),
 then again. CPU times include imports, compilers, meshing and figures, but not the start of a
-container. Wall times on an idle machine are up to half as long again. All scripts but that of the
-README, which has a test, end with an assertion of their result.
+container. Wall times on an idle machine are up to 50 % longer. All scripts but that of the README,
+which has a test, end with an assertion of their result.
 
     python benchmarks/tasks.py            # three minutes
     python benchmarks/tasks.py --short    # the script of the README only
@@ -24,7 +24,7 @@ from pathlib import Path
 from benchmarks import timing
 
 ROOT = Path(__file__).resolve().parent.parent
-# Tasks, and the scripts of the documentation.
+# Tasks, and the files of their scripts.
 TASKS = {
     "first script of the README": "README.md",
     "bracket meshed with Gmsh under a ball, plots in 3D": "docs/scripts/bracket.py",
@@ -80,7 +80,7 @@ def run(place: str, repeat: int) -> timing.Row:
 
 
 def main() -> None:
-    """Measure and write."""
+    """Run the benchmark and write its results."""
     parser = timing.parser(__doc__, "tasks")
     arguments = parser.parse_args()
     tasks = dict(list(TASKS.items())[:1]) if arguments.short else TASKS

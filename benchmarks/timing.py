@@ -1,8 +1,8 @@
-"""Shared by the benchmarks: repeated timing, CSV files and fitted power laws.
+"""Repeated timing, CSV files and fitted power laws for the benchmarks.
 
-A benchmark times named runs in turn, `repeat` times, so that other load of the machine affects all
-of them alike. Medians are reported, in seconds and in units of one of the runs. The first run of
-each, which compiles its forms, is timed separately on a small problem.
+A benchmark times named runs in turn, `repeat` times, so that other load of the machine affects them
+equally. Medians are reported, in seconds and in units of one of the runs. The first run of each,
+which compiles its forms, is timed separately on a small problem.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Runs = Mapping[str, Callable[[], Row]]
 
 
 def parser(documentation: str | None, folder: str) -> argparse.ArgumentParser:
-    """Return the options of every benchmark: ``--output``, ``--repeat`` and ``--short``."""
+    """Return the parser of a benchmark: ``--output``, ``--repeat`` and ``--short``."""
     made = argparse.ArgumentParser(
         description=(documentation or "").split("\n\n")[0],
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
@@ -44,7 +44,7 @@ def measure(
 
     Args:
         runs: Each solves a problem and returns the other columns of its row.
-        repeat: Number of timed runs.
+        repeat: Number of timed repetitions.
         first: The same names with small problems, each run once before. Its time is in
             "first run [s]", mostly the compilation of the forms if they are not cached.
         once: Runs that take longer than this are not repeated (s).
@@ -98,7 +98,7 @@ def fit(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
 
 
 def write(folder: Path, name: str, title: str, rows: Iterable[Row], notes: str = "") -> None:
-    """Write ``name``.csv with all digits, and print the rows as a table. On rank 0."""
+    """Write ``name``.csv with all digits, and print the rows as a table, on rank 0."""
     if MPI.COMM_WORLD.rank:
         return
     rows = list(rows)

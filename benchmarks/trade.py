@@ -1,4 +1,4 @@
-"""Accuracy versus cost: parameters varied on five problems, true error over time.
+"""Measure accuracy versus cost: true error over time, with parameters varied on five problems.
 
 Problems, errors and times are described on the page, docs/trade.md, which `trade_page.py` writes.
 
@@ -6,8 +6,8 @@ Problems, errors and times are described on the page, docs/trade.md, which `trad
     OMP_NUM_THREADS=1 python benchmarks/trade.py --short    # a minute; writes to --output only
     python benchmarks/trade.py --page                       # page and figures of docs/trade.csv
 
-Rows are stored in the output folder as they are computed: an interrupted study continues there;
-``--fresh`` starts anew. A setting that fails has a row, too.
+Rows are stored in the output folder as soon as they are computed; an interrupted study continues
+from them, and ``--fresh`` discards them. Failed settings have rows, too.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def timed(one: Scene, setting: Setting, repeat: int, limit: float = LIMIT) -> Ro
 
 
 class Store:
-    """Rows in a CSV file, each written when computed; an incomplete last line is dropped."""
+    """Rows in a CSV file, each written when computed; an incomplete last line is removed."""
 
     def __init__(self, path: Path) -> None:
         """Read the stored rows.
@@ -171,7 +171,7 @@ class Store:
             raise ValueError(f"{path} has columns of another study; use --fresh")
 
     def find(self, role: str, setting: Setting) -> dict[str, str] | None:
-        """Return the row of a setting."""
+        """Return the row of a setting, or None."""
         wanted = {"role": role} | {name: str(v) for name, v in asdict(setting).items()}
         return next((r for r in self.rows if all(r[k] == v for k, v in wanted.items())), None)
 
@@ -207,7 +207,7 @@ def write(path: Path, rows: Sequence[Row]) -> None:
 
 
 def study(scenes: dict[str, Scene], store: Store, repeat: int, short: bool) -> None:
-    """Compute the missing rows."""
+    """Compute the rows of the study that are not stored yet."""
     settings = [(one, setting) for one in scenes.values() for setting in sweep(one, short)]
     warm: set[tuple[Any, ...]] = set()
     quiet = None if MPI.COMM_WORLD.rank == 0 else True

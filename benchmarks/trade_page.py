@@ -1,4 +1,4 @@
-"""Evaluation of the rows of `benchmarks/trade.py`: non-dominated settings, figures, the page."""
+"""Evaluate the rows of `benchmarks/trade.py`: non-dominated settings, figures and the page."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def describe(row: Row, base: Setting) -> str:
 
 
 def comparable(row: Row, rows: Sequence[Row]) -> list[Row]:
-    """Return the solved rows of the same problem, mesh and degree, whose times have one unit."""
+    """Return the solved rows of a row's problem, mesh and degree: their times have one unit."""
     same = ("scene", "h", "degree")
     return [r for r in rows if solved(r) and all(r[name] == row[name] for name in same)]
 
@@ -44,7 +44,7 @@ def solved(row: Row) -> bool:
 
 
 def dominating(row: Row, rows: Sequence[Row], margin: float = MARGIN) -> list[Row]:
-    """Return the rows with both less error and less time, each by the margin."""
+    """Return the rows whose error and time are both smaller by the margin."""
     return [
         other
         for other in rows
@@ -53,7 +53,7 @@ def dominating(row: Row, rows: Sequence[Row], margin: float = MARGIN) -> list[Ro
 
 
 def front(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows that no other has both less error and less time than, fastest first."""
+    """Return the non-dominated rows (Pareto front), fastest first."""
     found: list[Row] = []
     for row in sorted(rows, key=lambda r: (float(r["time"]), float(r["error"]))):
         if not found or float(row["error"]) < float(found[-1]["error"]):
@@ -167,7 +167,7 @@ def _base(scenes: Mapping[str, Scene]) -> str:
 
 
 def _cell(row: Row | None) -> str:
-    """Return error, time and iterations."""
+    """Return error, time and iterations as text."""
     if row is None:
         return "–"
     if row["failure"]:
@@ -196,7 +196,7 @@ def draw(target: Path, scenes: Mapping[str, Scene], rows: Sequence[Row]) -> None
 
 
 def _grid(path: Path, scenes: Mapping[str, Scene], draw_one: Callable[[Any, Scene], None]) -> None:
-    """Draw a panel for each problem, and the common legend beside the last."""
+    """Draw a panel for each problem, and their common legend in the last panel."""
     with plotting.figure(path, size=(13.0, 7.6)) as axes:
         figure = axes.figure
         axes.remove()
@@ -213,7 +213,7 @@ def _grid(path: Path, scenes: Mapping[str, Scene], draw_one: Callable[[Any, Scen
 
 
 def _draw_settings(axes: Any, one: Scene, rows: Sequence[Row]) -> None:
-    """Draw error over time of all settings on the base mesh."""
+    """Plot error over time of all settings on the base mesh."""
     base = one.base
     here = comparable({"scene": one.name, "h": str(base.h), "degree": str(base.degree)}, rows)
     groups: dict[str, list[Row]] = {}
@@ -247,7 +247,7 @@ def _draw_settings(axes: Any, one: Scene, rows: Sequence[Row]) -> None:
 
 
 def _draw_meshes(axes: Any, one: Scene, rows: Sequence[Row]) -> None:
-    """Draw error over dofs by degree and enforcement."""
+    """Plot error over dofs by degree and enforcement."""
     for degree in (1, 2):
         for enforcement, line in ENFORCEMENTS:
             settings = [
@@ -262,7 +262,7 @@ def _draw_meshes(axes: Any, one: Scene, rows: Sequence[Row]) -> None:
 
 
 def _draw_parameters(path: Path, scenes: Mapping[str, Scene], rows: Sequence[Row]) -> None:
-    """Draw error and iterations over the stiffness, and error over the number of increments."""
+    """Plot error and iterations over the stiffness, and error over the number of increments."""
     with plotting.figure(path, 3, size=(4.8, 4.2)) as (left, middle, right):
         for number, one in enumerate(scenes.values()):
             for enforcement, line in ENFORCEMENTS:

@@ -1,4 +1,4 @@
-"""Problems of `benchmarks/trade.py`, and the settings that it runs."""
+"""Problems of `benchmarks/trade.py`, and the settings to solve them with."""
 
 from __future__ import annotations
 
@@ -83,12 +83,12 @@ class Scene:
     """A problem on all its meshes.
 
     Attributes:
-        name: Name.
+        name: Name of the problem.
         make: Creates the body with a cell size.
         sizes: Cell sizes, coarsest first, including that of ``base``.
         base: Base setting.
         reference: Setting of the reference solution; None if there is an exact solution.
-        published: Published values.
+        published: Published values by quantity.
         source: Source of the published values.
     """
 
@@ -217,7 +217,7 @@ def short_scenes() -> dict[str, Scene]:
 
 
 def sweep(one: Scene, short: bool) -> list[Setting]:
-    """Return the settings of a problem: one parameter at a time, and meshes."""
+    """Return the settings of a problem, which vary one parameter at a time, and the mesh."""
     base, friction = one.base, one.has_friction
     if short:
         return [

@@ -1,1 +1,1 @@
-"""Scripts that each show one use of the package; run them, or import what they are made of."""
+"""Scripts that each demonstrate one use of the package; their parts can also be imported."""

@@ -1,23 +1,24 @@
-"""Capstan: a rubber band over a drum that turns, and pulls it by friction.
+"""Capstan: a rubber band over a rotating drum that pulls it by friction.
 
 Plane strain, neo-Hookean; lengths in mm, stresses in MPa, forces per mm of width. The band
 (E = 10, ν = 0.45) lies on the upper half of a rigid drum (R = 10), its tails hang down on both
-sides. A weight pulls one of them by T1, the end of the other one is held. The drum turns against
-the held end until all of the band slips, and goes on: the band stretches by a tenth, and the drum
-runs away under it.
+sides. A weight loads one of them with T1, the end of the other one is fixed. The drum rotates away
+from the fixed end until the whole band slips, and further: the band is stretched by a tenth, and
+the drum slides below it.
 
     python demos/capstan.py
     python demos/capstan.py --thickness 0.5 --cells 40
     mpirun -n 2 python demos/capstan.py
 
-Reference: Euler's and Eytelwein's formula T2/T1 = exp(μφ), φ = π, of a band without thickness.
-A band of thickness t carries its tension at R + t/2, but is rubbed at R: the moment on a piece of
-it that bends no further is in balance if (R + t/2) dT = μ R q dφ, q dφ the force that presses it.
-So the exponent is less than Eytelwein's by the share t/(2R), and what bends at both ends of the
-contact is of this order, too. Checked are that the exponent lacks no more than 1.25 t/(2R), that
-it tends to Eytelwein's with t (extrapolated from the two thinnest bands, to the product of both
-t/R), p R/T in the middle of the drum (2 %, as q and T differ for the thickest) and the torque,
-(T2 - T1)(R + t/2) (0.5 %). The exit code is 1 if one of them is missed.
+Reference: the capstan equation of Euler and Eytelwein, T2/T1 = exp(μφ), φ = π, for a band without
+thickness. In a band of thickness t the tension acts at R + t/2, but friction at R: if the curvature
+is constant, the moment on a piece of it is in equilibrium if (R + t/2) dT = μ R q dφ, with the
+contact force q dφ. The exponent is therefore smaller than Eytelwein's by t/(2R) (relative); bending
+at both ends of the contact has an effect of this order, too. The checks are that the exponent
+differs by at most 1.25 t/(2R), that it tends to Eytelwein's with t (extrapolated from the two
+thinnest bands; tolerance: the product of both t/R), p R/T in the middle of the drum (2 %, as q and
+T differ for the thickest) and the torque, (T2 - T1)(R + t/2) (0.5 %). The exit code is 1 if one of
+them fails.
 """
 
 from __future__ import annotations
@@ -41,26 +42,26 @@ from fenics_contact import output, plotting
 from fenics_contact.elasticity import NeoHookean
 
 E, NU, MU, R, TAIL = 10.0, 0.45, 0.3, 10.0, 10.0
-STRAIN = 0.05  # T1 over E t, so that bands of all thicknesses stretch alike
+STRAIN = 0.05  # T1 / (E t), so that bands of all thicknesses stretch equally
 HELD, PULLED, INNER = 1, 2, 3
-TIGHT = 0.995  # radius of the band over that of the drum: it touches all along from the start
+TIGHT = 0.995  # radius of the band relative to the drum's: initially in contact along the drum
 EYTELWEIN = float(np.exp(MU * np.pi))
-# The drum's turn (rad): slowly while slip spreads, then on under a band that stands still. Slip is
-# counted along the chord of an increment Δ, by which 1 - cos(Δ/2) of the friction points aside:
-# the last increment is short.
+# Rotation of the drum (rad) at the ends of increments: small ones while slip spreads, then larger
+# ones below the slipping band. Slip in an increment Δ is along its chord, so that the tangential
+# friction lacks 1 - cos(Δ/2) of its magnitude: the last increment is small.
 TURN = (*(0.01 * np.arange(1, 21)), 0.6, 1.2, 1.8, 2.4, 3.0, 3.01)
 
 
 @dataclass
 class Run:
-    """One band.
+    """The results for one band.
 
     Attributes:
-        path: Turn of the drum (rad) and T2/T1 after every increment.
-        points: What `Contact.gather` returns, at the end.
-        angle: Of the points, where they are at the end (rad), 0 where T2 comes in.
-        pressure: Their true pressure, per deformed area.
-        torque: On the band.
+        path: Rotation of the drum (rad) and T2/T1 after every increment.
+        points: Result of `Contact.gather` at the end.
+        angle: Angular position of the points on the drum at the end (rad), 0 on the side of T2.
+        pressure: True pressure at the points, per deformed area.
+        torque: Torque on the band.
     """
 
     thickness: float
@@ -76,12 +77,12 @@ class Run:
 
     @property
     def ratio(self) -> float:
-        """T2/T1 at the end."""
+        """The ratio T2/T1 at the end."""
         return self.path[-1][1]
 
 
 def make_mesh(thickness: float, cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """The band, its cells curved like the drum; ``cells`` on each quarter of it. Collective."""
+    """Mesh the band with cells curved like the drum, ``cells`` per quarter of it. Collective."""
     gmsh.initialize()
     try:
         gmsh.option.setNumber("General.Terminal", 0)
@@ -89,7 +90,7 @@ def make_mesh(thickness: float, cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.
         if MPI.COMM_WORLD.rank == 0:
             geo, outer = gmsh.model.geo, R + thickness
             centre = geo.addPoint(0, 0, 0)
-            # Five cross-sections, from the held end to the weight, and four pieces between them.
+            # Five cross-sections, from the fixed end to the weight, and four pieces between them.
             sections = [
                 (geo.addPoint(x * R, y, 0), geo.addPoint(x * outer, y * far, 0))
                 for x, y, far in ((1, -TAIL, 1), (1, 0, 1), (0, R, outer / R), (-1, 0, 1))
@@ -129,7 +130,7 @@ def make_mesh(thickness: float, cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.
 
 
 def solve(thickness: float, cells: int) -> Run:
-    """Hang the weight on the band, then turn the drum. Collective."""
+    """Apply the weight to the band, then rotate the drum. Collective."""
     mesh, tags = make_mesh(thickness, cells)
     V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
@@ -137,7 +138,7 @@ def solve(thickness: float, cells: int) -> Run:
     weight, angle = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
     F = rubber.residual(v) + weight / thickness * v[1] * ds(PULLED)
-    # Both ends are led straight down.
+    # Both ends have zero horizontal displacement.
     held = fem.locate_dofs_topological(V.sub(1), 1, tags.find(HELD))
     led = fem.locate_dofs_topological(
         V.sub(0), 1, np.concatenate([tags.find(HELD), tags.find(PULLED)])
@@ -146,15 +147,15 @@ def solve(thickness: float, cells: int) -> Run:
 
     drum = fc.Cylinder((0, 0), R, rotation=fc.Rotation(angle, about=(0, 0)))
     surface = fc.ContactSurface(mesh, tags, INNER)
-    # Twenty times what the band as a hoop, E t/R², resists a pressure. Stiffer springs would gain
-    # nothing: a band that lies a little deeper turns by the same angle.
+    # Twenty times the stiffness E t/R² of the band as a hoop under pressure. A stiffer penalty has
+    # no advantage: the contact angle of the band does not depend on a small penetration.
     stiffness = 20 * E * thickness / R**2
-    friction = fem.Constant(mesh, 0.0)  # greased, until the weight hangs
+    friction = fem.Constant(mesh, 0.0)  # frictionless until the weight acts
     law = fc.Coulomb(friction, stiffness, stiffness)
     contact = fc.Contact(u, surface, drum, law, kinematics="finite")
     problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
 
-    # T2 is what the stresses do in a displacement of the held end by 1, upwards on the band.
+    # T2 is minus the virtual work of the stresses in a unit displacement of the fixed end upwards.
     lift = fem.Function(V)
     lift.x.array[held] = 1.0
     reaction = fem.form(ufl.action(rubber.residual(v), lift))
@@ -177,12 +178,12 @@ def solve(thickness: float, cells: int) -> Run:
 
 
 def along_the_drum(contact: fc.Contact) -> tuple[np.ndarray, np.ndarray]:
-    """Angle and true pressure at the closed points, in their order, on all ranks. Collective."""
+    """Return angle and true pressure of closed points on all ranks, sorted by angle. Collective."""
     closed = contact.pressure > 0
     _, normal = contact.true_placement()  # into the drum
     angle = np.arctan2(-normal[closed, 1], -normal[closed, 0])
     pressure = (contact.pressure / contact.area_stretch())[closed]
-    angle[angle < -np.pi / 2] += 2 * np.pi  # on the tail of the weight
+    angle[angle < -np.pi / 2] += 2 * np.pi  # points on the tail with the weight
     rows = MPI.COMM_WORLD.allgather(np.stack([angle, pressure]))
     angle, pressure = np.concatenate(rows, axis=1)
     order = np.argsort(angle)
@@ -190,13 +191,13 @@ def along_the_drum(contact: fc.Contact) -> tuple[np.ndarray, np.ndarray]:
 
 
 def compare(runs: list[Run]) -> dict[str, Any]:
-    """The bands beside their references."""
+    """Compare the bands with their references."""
     values, references = {}, {}
     for run in runs:
         t = f"t = {run.thickness:g}"
         values[f"ln(T2/T1), {t}"] = float(np.log(run.ratio))
         references[f"ln(T2/T1), {t}"] = (MU * np.pi, 1.25 * run.thickness / (2 * R))
-        # In the middle, far from where the band is straightened or bent.
+        # In the middle, away from the ends of the contact, where the curvature changes.
         middle = np.abs(run.angle - np.pi / 2) < np.pi / 6
         tension = run.tension * run.ratio ** (1 - run.angle[middle] / np.pi)
         values[f"p R/T, {t}"] = float(np.mean(run.pressure[middle] * R / tension))
@@ -212,7 +213,7 @@ def compare(runs: list[Run]) -> dict[str, Any]:
 
 
 def draw(path: Path, runs: list[Run]) -> None:
-    """Pressure along the drum, and the ratio of the tensions while it turns. On this rank."""
+    """Plot pressure along the drum, and tension ratio over its rotation. On this rank."""
     with plotting.figure(path, 2) as (left, right):
         at = np.linspace(0, np.pi, 200)
         for run in runs:
@@ -233,7 +234,7 @@ def draw(path: Path, runs: list[Run]) -> None:
 
 
 def main() -> int:
-    """Turn the drum under every band, and write all results; 0 if every reference is met."""
+    """Rotate the drum below every band, write all results; return 0 if every reference is met."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

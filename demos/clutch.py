@@ -1,22 +1,22 @@
-"""Clutch: a ring of rubber is pressed on a disc and turned until all of it slips, and on by 90°.
+"""Clutch: a rubber ring is pressed on a disc and rotated by 90°, far beyond full slip.
 
-In space, two bodies that deform, neo-Hookean; lengths in mm, stresses in MPa. The ring (radii 10
-and 20, 5 thick, E = 10, ν = 0.3) is bonded to a rigid plate above it, the disc (radii 8 and 22, 5
-thick, E = 100, ν = 0.3) to one below; their meshes do not match. The plates come together by 0.25,
-and then the upper one turns about the shaft. μ = 0.3.
+Two deformable neo-Hookean bodies in space; lengths in mm, stresses in MPa. The ring (radii 10 and
+20, thickness 5, E = 10, ν = 0.3) is bonded to a rigid plate above it, the disc (radii 8 and 22,
+thickness 5, E = 100, ν = 0.3) to one below; their meshes do not match. The plates approach each
+other by 0.25, and then the upper one rotates about the shaft. μ = 0.3.
 
     python demos/clutch.py
     python demos/clutch.py --cells 3
     mpirun -n 2 python demos/clutch.py
 
-References: the torque of textbooks for an even pressure, μ F 2/3 (b³ - a³)/(b² - a²) with the radii
-a and b (2 %: the ring has 32 sides, and its pressure is no more even than that); with the pressure
-p that is found ∫ μ p r dA, times cos(Δφ/2) where an increment turns by Δφ, as slip is the straight
-way of its points (1e-6, from 25° on: until then some of the slip is along the radius). The plate
-that holds the disc has the torque of the contact (1e-6: τ acts on ring and disc p/k_n apart). And
-a second run turns all of the scene as well, by 69° about an oblique axis until the ring is at 25°:
-the same force and torque at every increment (1e-7: the solver stops at 1e-9 of the forces). The
-exit code is 1 if one of them is missed.
+References: the textbook torque for a uniform pressure, μ F 2/3 (b³ - a³)/(b² - a²) with the radii a
+and b (2 %: the ring has 32 sides, and its pressure is not quite uniform); for the computed pressure
+p, ∫ μ p r dA times cos(Δφ/2) in an increment Δφ, as slip is measured along the chord of the path
+(1e-6, from 25° on: before, part of the slip is radial). The reaction torque at the disc's plate is
+that of the contact (1e-6: the points of action of τ on ring and disc are p/k_n apart). A second run
+also rotates the whole scene, by 69° about an oblique axis until the ring is at 25°: force and
+torque are the same in every increment (1e-7: the solver stops at 1e-9 of the forces). The exit code
+is 1 if one of them is missed.
 """
 
 from __future__ import annotations
@@ -42,18 +42,18 @@ RING, DISC = (10.0, 20.0), (8.0, 22.0)  # inner and outer radius
 THICK, DEPTH = 5.0, 0.25
 MODULI = {"ring": 10.0, "disc": 100.0}
 BOTTOM, TOP = 1, 2
-# Of the turn, at the ends of increments [°]: while it begins to slip, and then.
+# Angle of rotation at the ends of increments [°]: small ones at the onset of slip.
 ANGLES = (*np.arange(0.25, 1.6, 0.25), 2.5, *np.arange(5.0, 91.0, 5.0))
-STEADY = 25.0  # [°] of the turn, from which on slip goes round
-WHOLE, UNTIL = 1.2, 25.0  # [rad] turn of all of the scene, while the ring turns by so much [°]
+STEADY = 25.0  # angle from which slip is circumferential [°]
+WHOLE, UNTIL = 1.2, 25.0  # rotation of the whole scene [rad], and of the ring meanwhile [°]
 SHAFT = np.array([0.0, 0.0, 1.0])
 TURN, TURN_OF_ALL = (fc.Rotation(0.0, (0, 0, 0), axis) for axis in (SHAFT, (1, 2, 2)))
-# Of an even pressure: by it friction that slips all over has its torque.
+# Lever arm of friction at full slip with a uniform pressure.
 ARM = 2 / 3 * (RING[1] ** 3 - RING[0] ** 3) / (RING[1] ** 2 - RING[0] ** 2)
 
 
 def annulus(radii: tuple[float, float], low: float, cells: tuple[int, int, int]) -> tuple:
-    """A ring of hexahedra: cells around, along the radius, and through it. Collective."""
+    """Mesh a ring with numbers of hexahedra around, along the radius and through it. Collective."""
     gmsh.initialize()
     try:
         gmsh.option.setNumber("General.Terminal", 0)
@@ -93,12 +93,12 @@ def annulus(radii: tuple[float, float], low: float, cells: tuple[int, int, int])
 def solve(
     cells: int, until: float = ANGLES[-1], whole: float = 0.0
 ) -> tuple[list[dict[str, float]], fc.ContactProblem, NeoHookean]:
-    """Press and turn; force and torque after each increment. Collective.
+    """Press and rotate; return force and torque after each increment. Collective.
 
     Args:
-        cells: Across the ring.
+        cells: Number of cells across the ring.
         until: Last angle of the ring [°].
-        whole: Angle [rad] by which all of the scene is turned meanwhile about an oblique axis.
+        whole: Rotation of the whole scene meanwhile about an oblique axis [rad].
     """
     parts = {
         "disc": annulus(DISC, -THICK, (4 * round(3.5 * cells), cells + 1, 2)),
@@ -130,11 +130,11 @@ def solve(
     x = V.tabulate_dof_coordinates()
 
     def with_all(vectors: np.ndarray, t: float) -> np.ndarray:
-        """Turned as all of the scene is."""
+        """Return the vectors rotated with the whole scene at t."""
         return TURN_OF_ALL.rotate(vectors, whole * (t + 1) / (until + 1))
 
     def load(t: float) -> None:
-        """Pressed until 0, then turned by so many degrees."""
+        """Press until t = 0, then rotate by t degrees."""
         lowered = TURN.rotate(x, np.radians(max(t, 0))) - DEPTH * min(t + 1, 1) * SHAFT
         for body, place in (("disc", x), ("ring", lowered)):
             plates[body][0].x.array[:] = (with_all(place, t) - x).ravel()
@@ -170,7 +170,7 @@ def solve(
 
 
 def compare(path: list[dict[str, float]], turned: list[dict[str, float]]) -> dict[str, Any]:
-    """Torques of full slip, and the scene at rest beside the one that is turned."""
+    """Compare the torque at full slip with its references, and the rotated scene with the fixed."""
     ratios = [r["torque"] / r["of all slipping"] for r in path if r["angle"] >= STEADY]
     last = path[-1]
     values = {
@@ -188,7 +188,7 @@ def compare(path: list[dict[str, float]], turned: list[dict[str, float]]) -> dic
 
 
 def draw(file: Path, path: list[dict[str, float]]) -> None:
-    """Torque over the angle, while slip begins and all the way. On this rank."""
+    """Plot torque over angle, at the onset of slip and of the whole history. On this rank."""
     rows = path[1:]
     with plotting.figure(file, 2) as (left, right):
         for ax, until in ((left, 2.0), (right, ANGLES[-1])):
@@ -207,7 +207,7 @@ def draw(file: Path, path: list[dict[str, float]]) -> None:
 
 
 def main() -> int:
-    """Turn the ring, in a scene at rest and in one that turns; 0 if every reference is met."""
+    """Rotate the ring in a fixed and a rotating scene; return 0 if every reference is met."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

@@ -1,34 +1,34 @@
-"""A male-female fitting of two plates: oblique flanks that carry a pull, with friction.
+"""A male-female fitting of two plates: oblique flanks transmit a tensile load, with friction.
 
 The second example of Fancello, Feijóo and Zouain (section 6.2): plates of thickness 6.4 mm, plane
 stress, E = 240 daN/mm², ν = 0.38, μ = 0.2. The male plate's head sits in a slot of the female one,
-whose top is held vertically; a traction F = 0.02656 daN/mm² pulls the male one at its lower face.
+whose top is fixed vertically; a traction F = 0.02656 daN/mm² pulls the male one at its lower face.
 Both are deformable, their meshes do not match, and the flanks touch without gap.
 
-What can be claimed. The paper gives seven lengths, a = 87, b = 65, c = 43, d = 148, e = 60, f = 40,
-g = 89 mm; its figure, which says what they measure, is lost. So this is no reproduction of its
-table, but a fitting of the same kind, with this reading of the lengths, each of them an option:
+The paper gives seven lengths, a = 87, b = 65, c = 43, d = 148, e = 60, f = 40, g = 89 mm; the
+figure that defines them is lost. This demo therefore does not reproduce the paper's table, but
+solves a fitting of the same kind with the following definitions, each of them an option:
 
     a  width of the head at its top            d  width of the female plate
     b  width of the head at half its height,   e  length of the shank below the head
        the mean of a and c: not free           f  height of the head, and of the flanks
     c  width of the neck and the shank         g  height of the female plate above the neck
 
-Checked is what holds for every such geometry. With the flanks at the angle θ to the pull P, the
-product of F, the thickness and c,
+The checks hold for every such geometry. With the flanks at the angle θ to the load P, the product
+of F, the thickness and c,
 
-- the contact forces lift the male plate by P, as does the reaction at the top;
+- the vertical contact force on the male plate and the reaction at the top equal P;
 - each flank's normal force N is P/(2 sin θ) without friction, and with it between
   P/(2 (sin θ + μ cos θ)) and P/(2 (sin θ - μ cos θ));
-- as the gap is zero, twice the load makes twice the displacements, and a load in five increments
-  the displacements of one.
+- as the gap is zero, displacements are proportional to the load, and the same in five increments as
+  in one.
 
     python demos/fitting.py
     python demos/fitting.py --friction 0.4 --f 60
     mpirun -n 2 python demos/fitting.py
 
-The exit code is 1 if equilibrium is missed by more than 1e-7, the bounds at all, or the last two by
-more than 1e-8.
+The exit code is 1 if equilibrium is violated by more than 1e-7, the bounds at all, or the last two
+conditions by more than 1e-8.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ EQUILIBRIUM, SAME = 1e-7, 1e-8
 
 
 def make_mesh(g: argparse.Namespace) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """The right half of both plates; the neck is at y = 0, the axis at x = 0. Collective."""
+    """Mesh the right half of both plates; neck at y = 0, axis at x = 0. Collective."""
     gmsh.initialize()
     try:
         gmsh.option.setNumber("General.Terminal", 0)
@@ -66,7 +66,7 @@ def make_mesh(g: argparse.Namespace) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.Me
         gmsh.model.add("fitting")
         if MPI.COMM_WORLD.rank == 0:
             geo, neck, top, roof = gmsh.model.geo, g.c / 2, g.a / 2, g.f + CLEARANCE
-            # Corners anticlockwise, and what the side from each to the next is.
+            # Corners anticlockwise, and the tag of the side from each corner to the next.
             male = [(0, -g.e, PULLED), (neck, -g.e, 0), (neck, 0, HEAD)]
             male += [(top, g.f, 0), (0, g.f, AXIS)]
             female = [(neck, 0, 0), (g.d / 2, 0, 0), (g.d / 2, g.g, TOP), (0, g.g, AXIS)]
@@ -103,10 +103,10 @@ def make_mesh(g: argparse.Namespace) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.Me
 
 
 class Fitting:
-    """The fitting on a mesh, to be loaded from nothing any number of times."""
+    """The fitting on a mesh, which can be loaded repeatedly from the unloaded state."""
 
     def __init__(self, arguments: argparse.Namespace) -> None:
-        """Mesh and elasticity. Collective."""
+        """Create mesh and elasticity. Collective."""
         self.mesh, self.tags = make_mesh(arguments)
         V = fem.functionspace(self.mesh, ("Lagrange", arguments.degree, (2,)))
         self.u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
@@ -125,7 +125,7 @@ class Fitting:
     def pull(
         self, friction: float, load: float, steps: int = 1
     ) -> tuple[fc.ContactProblem, np.ndarray]:
-        """Load it from nothing; the problem, and a copy of the displacements. Collective."""
+        """Load the unloaded fitting; return problem and copied displacements. Collective."""
         self.u.x.array[:] = 0.0
         contact = fc.Contact(
             self.u,
@@ -140,13 +140,13 @@ class Fitting:
             bcs=self.bcs,
             contacts=[contact],
             method="newton",
-            petsc_options={"snes_rtol": 1e-12},  # what is compared below is equal to 1e-8
+            petsc_options={"snes_rtol": 1e-12},  # displacements are compared to 1e-8
         )
         list(fc.increments(problem, self.load, 0.0, load, steps=steps))
         return problem, self.u.x.array.copy()
 
     def reaction(self) -> float:
-        """Vertical force that the obstacle at the top exerts. Collective."""
+        """Return the vertical reaction at the fixed top. Collective."""
         residual = fem.Function(self.u.function_space)
         fem.assemble_vector(residual.x.array, fem.form(self.F))
         residual.x.scatter_reverse(dolfinx.la.InsertMode.add)
@@ -156,7 +156,7 @@ class Fitting:
 
 
 def differ(comm: MPI.Comm, one: np.ndarray, other: np.ndarray) -> float:
-    """Largest difference over the largest entry. Collective."""
+    """Return the largest difference relative to the largest entry. Collective."""
     gap, size = np.abs(one - other).max(initial=0.0), np.abs(one).max(initial=0.0)
     return comm.allreduce(gap, op=MPI.MAX) / comm.allreduce(size, op=MPI.MAX)
 
@@ -164,7 +164,7 @@ def differ(comm: MPI.Comm, one: np.ndarray, other: np.ndarray) -> float:
 def draw(
     path: Path, arguments: argparse.Namespace, drawn: list[tuple[str, dict[str, Any]]]
 ) -> None:
-    """Pressure and friction along the flank. On this rank."""
+    """Plot pressure and friction along the flank. On this rank."""
     corner = np.array([arguments.c / 2, 0.0])
     with plotting.figure(path) as axes:
         for colour, (label, points) in zip(("#9a9a9a", "#1f5fa8"), drawn, strict=True):
@@ -183,7 +183,7 @@ def draw(
 
 
 def main() -> int:
-    """Pull without and with friction; 0 if all that must hold does."""
+    """Pull without and with friction; return 0 if all checks pass."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

@@ -1,8 +1,8 @@
-"""Fretting: two pressed cylinders sheared to and fro, and the energy that friction takes.
+"""Fretting: two pressed cylinders under cyclic shear, and the energy dissipated by friction.
 
 The cylinders of ``two_cylinders.py``: R = 8 mm, E = 200 MPa, ν = 0.3, plane strain, μ = 0.2, both
-deformable, pressed by P = 10 N/mm. The shear force then goes 0 → Q → -Q → Q, with Q = 0.7 μP: slip
-rings at the ends of the contact, which never slides as a whole.
+deformable, pressed by P = 10 N/mm. The shear force is then 0 → Q → -Q → Q, with Q = 0.7 μP: the
+contact slips at its ends only.
 
     python demos/fretting.py
     python demos/fretting.py --share 0.5 --increments 20
@@ -12,20 +12,21 @@ Reference: Cattaneo and Mindlin for first loading by the force q, with c = a √
 
     t(x; q) = μ p₀ [√(1 - x²/a²) - c/a √(1 - x²/c²)]    (the second term inside c alone),
 
-and Masing's rule for the way back: from Q to q the traction is t(x; Q) - 2 t(x; (Q - q)/2), and the
-displacement follows the loading curve at twice its size. In the plane that curve depends on the
-bodies, but only by a term that is linear in q,
+and Masing's rule for unloading: from Q to q the traction is t(x; Q) - 2 t(x; (Q - q)/2), and the
+displacement follows the loading curve scaled by two. In the plane this curve depends on the bodies
+only by a term that is linear in q,
 
     δ(q) = C q + (μP/πE*) (1 - s) ln(1 - s),    s = q/(μP),    1/E* = 2(1 - ν²)/E.
 
-C, which is elastic, is taken from the computed amplitude; the energy per cycle owes nothing to it:
+The elastic compliance C is taken from the computed amplitude; the energy per cycle is independent
+of it:
 
     W = 8 (μP)²/(πE*) [ s (1 - s) ln(1 - s)/2 - ∫₀ˢ (1 - t) ln(1 - t) dt ].
 
-The area of the computed loop, by trapezoids, and the work of friction at the points of the contact,
-|τ| times the slip, are two measurements of W. The exit code is 1 if either misses it by more than
-1 %, if the loop does not close to 1e-4 of its width, or if the shear that is left in the centre at
-q = 0 on the way back misses its reference by more than 3 %.
+W is computed twice: as the area of the loop, by the trapezoidal rule, and as the work of
+friction at the points of the contact, |τ| times the slip. The exit code is 1 if either differs from
+W by more than 1 %, if the loop does not close to 1e-4 of its width, or if the residual shear in the
+centre at q = 0 in unloading differs from its reference by more than 3 %.
 """
 
 from __future__ import annotations
@@ -52,32 +53,32 @@ ENERGY, SHEAR, CLOSURE = 0.01, 0.03, 1e-4
 
 
 def loading(x: np.ndarray, force: float) -> np.ndarray:
-    """Shear traction of first loading by ``force``."""
+    """Return the shear traction of first loading by ``force``."""
     c = A * np.sqrt(1 - force / LIMIT)
     full = np.sqrt(np.maximum(0, 1 - (x / A) ** 2))
     return FRICTION * PEAK * (full - c / A * np.sqrt(np.maximum(0, 1 - (x / c) ** 2)))
 
 
 def unloaded(x: np.ndarray, force: float) -> np.ndarray:
-    """Shear traction that is left when the force is back from ``force`` to zero."""
+    """Return the residual shear traction after unloading from ``force`` to zero."""
     return loading(x, force) - 2 * loading(x, force / 2)
 
 
 def bend(force: np.ndarray) -> np.ndarray:
-    """The part of the displacement that is not linear in the force, in first loading."""
+    """Return the nonlinear part of the displacement in first loading by ``force``."""
     s = force / LIMIT
     return LIMIT / (np.pi * E_STAR) * (1 - s) * np.log(1 - s)
 
 
 def energy(force: float) -> float:
-    """Energy per cycle between ±``force``, per length of the cylinders."""
+    """Return the energy per cycle between ±``force``, per length of the cylinders."""
     r = 1 - force / LIMIT
     area = (1 - r) * r * np.log(r) / 2 + 1 / 4 + r**2 / 2 * np.log(r) - r**2 / 4
     return 8 * LIMIT**2 / (np.pi * E_STAR) * area
 
 
 def solve(arguments: argparse.Namespace) -> tuple[Pressed, dict[str, Any]]:
-    """Press, shear to and fro, and measure. Collective."""
+    """Press, apply cyclic shear, and compare with the references. Collective."""
     start = time.perf_counter()
     scene = press(arguments.cells, arguments.degree, arguments.stiffness)
     contact, comm = scene.contact, MPI.COMM_WORLD
@@ -86,7 +87,7 @@ def solve(arguments: argparse.Namespace) -> tuple[Pressed, dict[str, Any]]:
     before = contact.gather()["slip"]
     rows = [{"force": 0.0, "displacement": 0.0, "work": 0.0, "iterations": 0}]
     left: dict[str, np.ndarray] = {}
-    # One way is two phases, so that one increment ends at no force.
+    # A reversal has two phases, so that an increment ends at zero force.
     turns = np.array([0, 1, 0, -1, 0, 1]) * amplitude / (2 * R)
     bar = tqdm(total=5 * steps, disable=None if comm.rank == 0 else True, unit="increment")
     for phase, (first, last) in enumerate(itertools.pairwise(turns)):
@@ -104,7 +105,7 @@ def solve(arguments: argparse.Namespace) -> tuple[Pressed, dict[str, Any]]:
     bar.close()
 
     force, moved, work, _ = (np.array([row[k] for row in rows]) for k in rows[0])
-    cycle = slice(steps, None)  # from the first turn on
+    cycle = slice(steps, None)  # from the first reversal
     area = float(np.trapezoid(force[cycle], moved[cycle]))
     top, bottom = moved[steps], moved[3 * steps]
     shear = -left["tangential_traction"][:, 0]
@@ -132,14 +133,14 @@ def solve(arguments: argparse.Namespace) -> tuple[Pressed, dict[str, Any]]:
 
 
 def draw(path: Path, result: dict[str, Any]) -> None:
-    """The loop, and the shear left at no force, beside the theory. On this rank."""
+    """Plot the loop and the residual shear with the theory. On this rank."""
     force, moved = (np.array([r[k] for r in result["rows"]]) for k in ("force", "displacement"))
     most, steps = result["amplitude"], (len(force) - 1) // 5
-    # What a contact that sticks all over would do is elastic: without it the loop opens.
+    # The elastic displacement of a fully sticking contact is subtracted to show the loop.
     stuck = (moved[steps] - bend(np.array(most))) / most - 1 / (np.pi * E_STAR)
     q = np.linspace(0, most, 200)
     first = bend(q) + q / (np.pi * E_STAR)
-    swing = 2 * first  # at twice the force, from one turn to the other
+    swing = 2 * first  # displacement between reversals, at twice the force
     with plotting.figure(path, 2) as (left, right):
         left.plot(1e3 * first, q, "k--", linewidth=1, label="Mindlin, Masing")
         left.plot(1e3 * (first[-1] - swing), most - 2 * q, "k--", linewidth=1)
@@ -165,7 +166,7 @@ def draw(path: Path, result: dict[str, Any]) -> None:
 
 
 def main() -> int:
-    """Run it; 0 if every reference is met."""
+    """Run the demo; return 0 if every reference is met."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

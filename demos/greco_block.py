@@ -1,15 +1,15 @@
 """The GRECO block: a frictional benchmark with open, slipping and sticking parts.
 
 A block 40 mm x 40 mm, plane strain, E = 130 GPa, ν = 0.2, on a rigid plane with friction μ = 1, is
-pressed on its top by f = 50 MPa and pushed on its left side by F = 150 MPa; its right side cannot
-move along x (Raous et al.; Code_Aster SSNV128). Its left bottom corner lifts, the middle slips, the
-right sticks.
+pressed on its top by f = 50 MPa and on its left side by F = 150 MPa; u_x = 0 on its right side
+(Raous et al.; Code_Aster SSNV128). On its bottom the left part opens, the middle slips, and the
+right part sticks.
 
     python demos/greco_block.py
     python demos/greco_block.py --cells 64 --increments 10
 
 As the gap is zero and the load proportional, the number of increments does not matter. The exit
-code is 1 if the displacements miss the converged ones by more than 0.3 %.
+code is 1 if the displacements differ from the converged ones by more than 0.3 %.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ TOP_PRESSURE, SIDE_PRESSURE = 50.0, 150.0
 BOTTOM, RIGHT, TOP, LEFT = 1, 2, 3, 4
 
 PLACES = np.array([0.0, 1.25, 5.0, 7.5, 11.25])
-# u_x on y = 0 in µm at these places: converged, with exact complementarity; and Code_Aster's.
+# u_x on y = 0 in µm at these positions: converged, with exact complementarity; and Code_Aster's.
 CONVERGED = np.array([28.603, 27.226, 22.868, 19.807, 15.414])
 CODE_ASTER = np.array([28.598, 27.208, 22.827, 19.792, 15.406])
 SHEAR = 1405.36  # N/mm, converged
@@ -43,7 +43,7 @@ TOLERANCE = 0.003
 
 
 def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """Quadrilaterals, finer towards the left bottom corner where the contact opens. Collective."""
+    """Mesh the block, finer towards the left bottom corner where it opens. Collective."""
     mesh = dolfinx.mesh.create_rectangle(
         MPI.COMM_WORLD, [(0, 0), (SIZE, SIZE)], (cells, cells), dolfinx.mesh.CellType.quadrilateral
     )
@@ -61,7 +61,7 @@ def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
 
 
 def solve(arguments: argparse.Namespace) -> tuple[fc.ContactProblem, dict[str, Any]]:
-    """Build and load the block, and measure. Collective."""
+    """Load the block, and compare with the references. Collective."""
     start = time.perf_counter()
     mesh, tags = make_mesh(arguments.cells)
     increments = arguments.increments
@@ -107,7 +107,7 @@ def solve(arguments: argparse.Namespace) -> tuple[fc.ContactProblem, dict[str, A
 
 
 def along_bottom(u: fem.Function) -> np.ndarray:
-    """u_x at `PLACES` on the bottom, linear between the nodes. Collective."""
+    """Return u_x at `PLACES` on the bottom, interpolated between the nodes. Collective."""
     space = u.function_space
     n_owned = space.dofmap.index_map.size_local
     x = space.tabulate_dof_coordinates()[:n_owned]
@@ -118,7 +118,7 @@ def along_bottom(u: fem.Function) -> np.ndarray:
 
 
 def zones(contact: fc.Contact) -> dict[str, list[float]]:
-    """Extent along x of the open, slipping and sticking parts. Collective."""
+    """Return the extent along x of the open, slipping and sticking parts. Collective."""
     points = contact.gather()
     return {
         status.name.lower(): [float(x.min()), float(x.max())]
@@ -128,7 +128,7 @@ def zones(contact: fc.Contact) -> dict[str, list[float]]:
 
 
 def report(result: dict[str, Any]) -> None:
-    """Print the results beside the references."""
+    """Print the results and the references."""
     its = result["iterations"]
     print(
         f"{result['dofs']} dofs, {result['increments']} increments, {sum(its)} iterations, "
@@ -148,7 +148,7 @@ def report(result: dict[str, Any]) -> None:
 
 
 def main() -> int:
-    """Run the benchmark; 0 if it meets its reference."""
+    """Run the benchmark; return 0 if its references are met."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

@@ -2,25 +2,24 @@
 
 The first example of Fancello, Feijóo and Zouain (section 6.1): a long half-cylinder, plane
 strain, E = 1000, R = 8, ν = 0.3, loaded by a uniform pressure q = 30 on its flat top; friction
-coefficient 0 and 0.2. By symmetry a quarter of the disc is modelled, with u_x = 0 on the axis;
-nothing but contact holds it vertically. Any consistent units: here mm, N, MPa, forces per mm of
-thickness.
+coefficient 0 and 0.2. By symmetry a quarter of the disc is modelled, with u_x = 0 on the axis; only
+contact constrains it vertically. Any consistent units: here mm, N, MPa, forces per mm of thickness.
 
     python demos/hertz.py                                  # the paper's mesh, both frictions
     python demos/hertz.py --h 0.05 --degree 2 --friction 0.2 --increments 80
-    python demos/hertz.py --load 1 --h 0.02 --friction 0   # thin contact: Hertz's own theory
-    python demos/hertz.py --errors                         # how wrong it is, and what to change
+    python demos/hertz.py --load 1 --h 0.02 --friction 0   # narrow contact: Hertz's theory
+    python demos/hertz.py --errors                         # error estimates, and what to change
     python demos/hertz.py --convergence                    # error against h
-    python demos/hertz.py --solver auto                    # by the package's own choice
+    python demos/hertz.py --solver auto                    # solver chosen by the package
     mpirun -n 2 python demos/hertz.py
 
-Hertz's theory takes the body for a half-plane and the contact for small against R. Here a/R = 0.26,
-so that it is off by 1.6 % in the pressure; the values to meet are those of an independent solution
-of this very body with exact complementarity, on converged meshes. With friction the result depends
-on the history of the load: one increment gives 14 % more shear than eighty.
+Hertz's theory assumes a half-plane and a contact that is small relative to R. Here a/R = 0.26, and
+the theory's pressure has an error of 1.6 %; the references are an independent solution of this body
+with exact complementarity, on converged meshes. With friction the result depends on the load
+history: one increment gives 14 % more shear than eighty.
 
-It is solved by the paper's method, SNES in quasi-Newton mode (L-BFGS), unless ``--solver`` says
-otherwise. The exit code is 1 if a result misses its reference by more than its tolerance.
+The default solver is the paper's method, SNES in quasi-Newton mode (L-BFGS); ``--solver`` selects
+another one. The exit code is 1 if a result differs from its reference by more than its tolerance.
 """
 
 from __future__ import annotations
@@ -47,9 +46,9 @@ E, NU, R = 1000.0, 0.3, 8.0
 PAPER_LOAD, PAPER_H = 30.0, 0.42  # 0.42: ten contact elements on the quarter, as in the paper
 E_STAR = E / (1 - NU**2)
 AXIS, TOP, ARC, CONTACT = 1, 2, 3, 4
-CONTACT_ANGLE = np.pi / 6  # the part of the arc that may touch
+CONTACT_ANGLE = np.pi / 6  # angle of the arc that is Γc
 
-# Independent solution with exact complementarity, full half-disc, converged meshes.
+# Independent solution with exact complementarity, for the whole half-disc on converged meshes.
 EXACT: dict[float, dict[str, Any]] = {
     0.0: {
         "peak_pressure": 142.6,
@@ -72,7 +71,7 @@ EXACT: dict[float, dict[str, Any]] = {
 
 
 def hertz(load: float) -> tuple[float, float]:
-    """Half-width and peak pressure of Hertz's theory for the pressure ``load`` on the top."""
+    """Return Hertz's half-width and peak pressure for the pressure ``load`` on the top."""
     force = 2 * R * load
     a = np.sqrt(4 * force * R / (np.pi * E_STAR))
     return a, 2 * force / (np.pi * a)
@@ -81,11 +80,10 @@ def hertz(load: float) -> tuple[float, float]:
 def make_mesh(
     h: float, fine: float, grading: float = 0.3, coarsest: float = R / 4
 ) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """Quarter disc touching y = 0 at the origin, cells of size ``h`` up to x = ``fine``.
+    """Return a quarter disc touching y = 0 at the origin, with cells of size ``h`` up to ``fine``.
 
-    Beyond they grow by ``grading`` times the distance, up to the size ``coarsest``.
-    Cells are curved (second order), so that the gap at every point is that of the circle.
-    Collective.
+    Beyond x = ``fine`` they grow by ``grading`` times the distance, up to the size ``coarsest``.
+    Cells are curved (second order), so that the gap is that of the circle. Collective.
     """
     comm = MPI.COMM_WORLD
     gmsh.initialize()
@@ -122,7 +120,7 @@ def make_mesh(
 
 @dataclass
 class Scene:
-    """The half-cylinder, ready to be loaded."""
+    """The unloaded half-cylinder with its contact problem."""
 
     problem: fc.ContactProblem
     contact: fc.Contact
@@ -134,14 +132,14 @@ class Scene:
 def build(
     arguments: argparse.Namespace, friction: float, h: float, load: float, **options: Any
 ) -> Scene:
-    """Mesh, elasticity and contact, the mesh made for the pressure ``load``. Collective.
+    """Create mesh, elasticity and contact, the mesh for the pressure ``load``. Collective.
 
-    ``options`` are PETSc's.
+    ``options`` are options of PETSc.
     """
     a, _ = hertz(load)
     mesh, tags = make_mesh(h, 1.3 * a)
 
-    # The elasticity problem, as any FEniCSx user writes it.
+    # The elasticity problem in plain DOLFINx.
     V = fem.functionspace(mesh, ("Lagrange", arguments.degree, (2,)))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
     shear = fem.Constant(mesh, PETSc.ScalarType(E / (2 * (1 + NU))))
@@ -157,7 +155,7 @@ def build(
     on_axis = fem.locate_dofs_topological(V.sub(0), 1, tags.find(AXIS))
     bcs = [fem.dirichletbc(PETSc.ScalarType(0.0), on_axis, V.sub(0))]
 
-    # Contact: a law, where it acts, and on what is pressed.
+    # Contact: law, contact surface and obstacle.
     stiffness = {n: k for n, k in (("k_n", arguments.k_n), ("k_t", arguments.k_t)) if k}
     law: fc.Coulomb | fc.Frictionless
     if friction > 0:
@@ -175,11 +173,11 @@ def build(
 
 
 def solve(arguments: argparse.Namespace, friction: float) -> tuple[Scene, dict[str, Any]]:
-    """Build, load and measure one case. Collective."""
+    """Solve one case, and return its problem and results. Collective."""
     start = time.perf_counter()
     load = arguments.load
     scene = build(arguments, friction, arguments.h, load)
-    # Without friction the state does not depend on the way there: one increment.
+    # Without friction the state does not depend on the load path: one increment.
     steps = arguments.increments or (80 if friction > 0 else 1)
     if arguments.accuracy is not None and not arguments.increments:
         steps = scene.problem.default_increments
@@ -221,13 +219,13 @@ def solve(arguments: argparse.Namespace, friction: float) -> tuple[Scene, dict[s
 
 
 def measure(contact: fc.Contact, u: fem.Function) -> dict[str, Any]:
-    """The figures to compare. Collective."""
+    """Return the results to compare with references. Collective."""
     points, resultants = contact.gather(), contact.resultants()
     x, status = points["x"][:, 0], points["status"]
     shear = np.abs(points["tangential_traction"][:, 0])
     half_width = crossing(x, points["gap"])
-    # The stick zone ends where |τ| reaches the limit; it is 1 on slipping points, so that the
-    # crossing lies between the last sticking and the first slipping point.
+    # The stick zone ends where |τ| reaches the friction bound; their ratio is 1 at slipping points,
+    # so that the end lies between the last sticking and the first slipping point.
     sticking = np.flatnonzero(status == fc.Status.STICK)
     last = int(sticking[-1]) if sticking.size else -1
     stick = 0.5 * (x[last] + x[last + 1]) if 0 <= last < len(x) - 1 else 0.0
@@ -244,7 +242,7 @@ def measure(contact: fc.Contact, u: fem.Function) -> dict[str, Any]:
 
 
 def crossing(x: np.ndarray, gap: np.ndarray) -> float:
-    """Where the gap opens: linear between the last closed and the first open point."""
+    """Return x at zero gap, interpolated between the last closed and the first open point."""
     closed = np.flatnonzero(gap < 0)
     if closed.size == 0:
         return 0.0
@@ -255,13 +253,12 @@ def crossing(x: np.ndarray, gap: np.ndarray) -> float:
 
 
 def compare(result: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """Put references and tolerances beside the results.
+    """Compare the results with references, with tolerances that depend on the mesh.
 
-    The mesh decides what can be asked. To 0.4 % (with friction, whose history is followed in
-    steps: 1 %) comes 0.5 h/(degree a) for tractions and forces, 0.15 h/(degree a) for
-    displacements, and for positions the spacing of the points on Γc, or one cell of the mesh if
-    that is linear. The largest shear stands in a profile that the steps of the load ripple, the
-    reference's own too: 2 % there.
+    Tolerances are 0.4 % (with friction 1 %, because of the load increments), plus 0.5 h/(degree a)
+    for tractions and forces, 0.15 h/(degree a) for displacements, and for positions the spacing of
+    the points on Γc, or one cell of a linear mesh. The tolerance of the largest shear is 1 % more,
+    since the load increments cause ripples in its profile, also in the reference.
     """
     friction, load = result["friction"], result["load"]
     a, p0 = hertz(load)
@@ -296,7 +293,7 @@ def compare(result: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def report(result: dict[str, Any]) -> None:
-    """Print the results with their references beside them."""
+    """Print the results and their references."""
     a, p0 = hertz(result["load"])
     its = result["iterations"]
     increments = f"{len(its)} increment{'s' * (len(its) > 1)}"
@@ -327,12 +324,12 @@ def report(result: dict[str, Any]) -> None:
 
 
 def show(value: Any) -> str:
-    """A number or a pair of numbers, short."""
+    """Format a number or a pair of numbers."""
     return " ".join(f"{v:.5g}" for v in np.atleast_1d(value))
 
 
 def write(folder: Path, scene: Scene, result: dict[str, Any]) -> None:
-    """Pictures and ParaView files of one case. Collective."""
+    """Write figures and ParaView files of one case. Collective."""
     friction, load = result["friction"], result["load"]
     fc.Writer(folder, scene.problem, stress=scene.stress).write(load)
     title = f"Half-cylinder on a rigid plane, μ = {friction:g}, q = {load:g} MPa"
@@ -362,10 +359,10 @@ def write(folder: Path, scene: Scene, result: dict[str, Any]) -> None:
 
 
 def convergence(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Error of the pressure against Hertz for a thin contact (a/R = 0.02), and its rate.
+    """Compute pressure errors relative to Hertz for a narrow contact (a/R = 0.02), and their rate.
 
-    Most of the error is made where the contact ends, and depends on where in its facet that is: on
-    each mesh it is the root mean square over eight loads that lead the end through one facet.
+    The error arises mostly at the end of the contact, and depends on its position in a facet: on
+    each mesh it is the root mean square over eight loads that move the end through one facet.
     Collective.
     """
     largest = 0.02 * R
@@ -417,7 +414,7 @@ def convergence(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def parse() -> argparse.Namespace:
-    """The command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
@@ -444,7 +441,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--errors", action="store_true", help="estimate the errors, part by part")
     parser.add_argument("--convergence", action="store_true", help="errors over h, and their rate")
     parser.add_argument("--output", type=Path, default=Path("output/hertz"), help="folder to write")
-    # PETSc reads its own options, such as -contact_snes_monitor, from the same command line.
+    # The command line may also have options of PETSc, such as -contact_snes_monitor.
     arguments, _ = parser.parse_known_args()
     if arguments.accuracy is not None and arguments.accuracy[0].isdigit():
         arguments.accuracy = float(arguments.accuracy)
@@ -454,7 +451,7 @@ def parse() -> argparse.Namespace:
 
 
 def main() -> int:
-    """Run what was asked for; 0 if every reference is met."""
+    """Run the requested study; return 0 if every reference is met."""
     arguments = parse()
     comm = MPI.COMM_WORLD
     if comm.rank == 0:
@@ -463,8 +460,8 @@ def main() -> int:
     if arguments.convergence:
         study = convergence(arguments)
         output.write_json(arguments.output / "convergence.json", study, comm)
-        # The pressure ends like a square root: no uniform mesh does better than 1 in L2, whatever
-        # the degree.
+        # The pressure ends like a square root: on uniform meshes the L2 rate is at most 1 for every
+        # degree.
         return 0 if study["rate"] > 0.7 else 1
     runs = []
     for friction in arguments.friction:
@@ -478,7 +475,7 @@ def main() -> int:
         comm.barrier()
         write(folder, scene, result)
         runs.append(result)
-    # At the top level stands the last case; `runs` has all of them.
+    # The last case is at the top level; `runs` has all cases.
     output.write_json(arguments.output / "result.json", {**runs[-1], "runs": runs}, comm)
     if comm.rank == 0:
         print(f"\nWritten to {arguments.output}/")

@@ -1,15 +1,15 @@
-"""A block on an incline: it sticks up to the friction angle, and a load beyond it is refused.
+"""A block on an incline: it sticks up to the friction angle, and larger loads are refused.
 
 An elastic block, 60 mm x 20 mm, plane strain, E = 1000 MPa, ν = 0.3, on a rigid plane.
 
-Tilting. The block lies under its own weight, and the plane is tilted. Friction alone holds it,
-μ = 0.3, which statics allows as long as
+Tilting. The block is loaded by its weight, and the plane is tilted. Only friction constrains the
+block tangentially, μ = 0.3. Equilibrium requires
 
-    tan α ≤ μ,    with  T/N = tan α  on the way there.
+    tan α ≤ μ,    with  T/N = tan α  up to this limit.
 
-Parts of the base slip before, as the block deforms, but it stays. Beyond, no equilibrium exists,
-and the library says so before it iterates; the demo halves the interval between the steepest slope
-that holds and the least that does not.
+Below it parts of the base slip, as the block deforms, but the block does not slide. Above it there
+is no equilibrium, and the package refuses the load before the first iteration. The demo bisects the
+interval between the steepest accepted slope and the smallest refused one.
 
 Pushing (the sliding wedge, NAFEMS CGS-4). On a slope of tan α = 0.1 the block, of weight G, is
 pushed uphill by a horizontal displacement of its lower end, until all of its base slips. Then
@@ -20,8 +20,8 @@ pushed uphill by a horizontal displacement of its lower end, until all of its ba
     python demos/incline.py --cells 60 --friction 0.5
     mpirun -n 2 python demos/incline.py
 
-The exit code is 1 if the slope that is refused misses μ, or the ratio T/N the slope, by more than
-1e-4, or one of the forces F/G its formula by more than 1e-6: statics leaves no room for more.
+The exit code is 1 if the refused slope differs from μ, or the ratio T/N from the slope, by more
+than 1e-4, or one of the forces F/G from its formula by more than 1e-6; statics is exact.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ STATICS, SLIDING = 1e-4, 1e-6
 
 
 class Block:
-    """The block on the plane through the origin with the slope ``slope``, uphill along x."""
+    """The block on a plane through the origin with the slope ``slope``, ascending along x."""
 
     def __init__(self, arguments: argparse.Namespace, slope: float, friction: float) -> None:
-        """Mesh, elasticity and contact. Collective."""
+        """Create mesh, elasticity and contact. Collective."""
         cells = (arguments.cells, max(2, arguments.cells // 3))
         self.mesh = dolfinx.mesh.create_rectangle(MPI.COMM_WORLD, [(0, 0), (LENGTH, HEIGHT)], cells)
         on = {BASE: lambda x: np.isclose(x[1], 0), END: lambda x: np.isclose(x[0], 0)}
@@ -80,14 +80,14 @@ class Block:
         self.contact = fc.Contact(self.u, surface, floor, law)
 
     def slipping(self) -> float:
-        """Share of the base that slips. Collective."""
+        """Return the slipping fraction of the area of the base. Collective."""
         points = self.contact.gather()
         slip = points["measure"] @ (points["status"] == fc.Status.SLIP)
         return float(slip / points["measure"].sum())
 
 
 def tilt(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Tilt the plane until the block is refused; halve the interval. Collective."""
+    """Tilt the plane until the load is refused, and bisect the interval. Collective."""
     friction = arguments.friction
     block = Block(arguments, 0.0, friction)
     problem = fc.ContactProblem(block.F, block.u, contacts=[block.contact])
@@ -95,7 +95,7 @@ def tilt(arguments: argparse.Namespace) -> dict[str, Any]:
     rows, holds, refused, message = [], 0.0, np.inf, ""
     steps = [0.25, 0.5, 0.75, 0.9, 0.95, 0.99]
     while refused - holds > STATICS:
-        # First up the steps and past the limit, then into the middle of what is left.
+        # First the given steps and a value above the limit, then bisection.
         share = steps.pop(0) if steps else 1.013 if refused > 2 else (holds + refused) / 2
         present = float(block.tilt.value)
         try:
@@ -121,7 +121,7 @@ def tilt(arguments: argparse.Namespace) -> dict[str, Any]:
 def push(
     arguments: argparse.Namespace, friction: float
 ) -> tuple[fc.ContactProblem, Block, dict[str, Any]]:
-    """Push the block up the slope by its lower end. Collective."""
+    """Push the block uphill by a displacement of its lower end. Collective."""
     block = Block(arguments, WEDGE_SLOPE, friction)
     V = block.u.function_space
     pushed = fem.Constant(block.mesh, PETSc.ScalarType(0.0))
@@ -143,7 +143,7 @@ def push(
 
 
 def draw(path: Path, tilted: dict[str, Any], pushed: list[dict[str, Any]]) -> None:
-    """T/N and the slipping share over the slope; F/G over the displacement. On this rank."""
+    """Plot T/N and slipping fraction over slope, and F/G over displacement. On this rank."""
     with plotting.figure(path, 2) as (left, right):
         slope, ratio, slip = (
             np.array([row[key] for row in tilted["rows"]]) for key in ("slope", "T/N", "slip")
@@ -175,12 +175,12 @@ def draw(path: Path, tilted: dict[str, Any], pushed: list[dict[str, Any]]) -> No
 
 
 def sliding(friction: float) -> float:
-    """F/G of a block that slides uphill."""
+    """Return F/G of a block that slides uphill."""
     return (WEDGE_SLOPE + friction) / (1 - friction * WEDGE_SLOPE)
 
 
 def main() -> int:
-    """Tilt and push; 0 if statics is met."""
+    """Tilt and push; return 0 if the results agree with statics."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

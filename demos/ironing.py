@@ -1,9 +1,9 @@
 """Ironing: a rigid cylinder pressed into an elastic block by a force, and dragged along it.
 
-Plane strain; lengths in mm, stresses in MPa, forces per mm of thickness. The cylinder (R = 12)
-bears the force P = 4.5 and is moved by 4 along a block (E = 1000, ν = 0.3, μ = 0.3), held at its
-bottom, so far away that it stands for a half-plane. On its way, sixteen half-widths of the contact,
-the cylinder passes more than a hundred facets. Its height is not prescribed: it follows from P.
+Plane strain; lengths in mm, stresses in MPa, forces per mm of thickness. The cylinder (R = 12) is
+loaded by the force P = 4.5 and moved by 4 along a block (E = 1000, ν = 0.3, μ = 0.3), which is
+fixed at its bottom and so large that it approximates a half-plane. The cylinder slides by sixteen
+half-widths of the contact, over more than a hundred facets. Its height is unknown, given by P.
 
     python demos/ironing.py
     python demos/ironing.py --cells 4 --increments 20
@@ -14,11 +14,11 @@ section 7.2). With tan(πγ) = μ (1-2ν)/(2(1-ν)) and E* = E/(1-ν²)
 
     P = π a² E* (1 - 4γ²)/(4R),    p(x) = E*/(2R) cos(πγ) (a + x)^{1/2-γ} (a - x)^{1/2+γ},
 
-x along the way: a little skewed against Hertz's, for friction moves the surface along the normal,
-too. Checked are half-width and peak (2 %), that the peak keeps still while the cylinder slides
-(1 %), T = μN and the vertical force P (1e-6), and that the work of the drag goes into friction
-(1 %; what small displacements leave out of it grows with a/R). The exit code is 1 if one of them is
-missed.
+with x in the sliding direction: slightly asymmetric, unlike Hertz's, as friction also displaces the
+surface along the normal. The checks are half-width and peak (2 %), constancy of the peak during
+sliding (1 %), T = μN and the vertical force P (1e-6), and the ratio of friction dissipation to the
+work of the drag (1 %; the error of small displacements grows with a/R). The exit code is 1 if one
+of them fails.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from fenics_contact import output, plotting
 from fenics_contact.elasticity import LinearElastic
 
 E, NU, MU, R, P = 1000.0, 0.3, 0.3, 12.0, 4.5
-WAY, SIZE = 4.0, 60.0  # of the cylinder; of the block
+WAY, SIZE = 4.0, 60.0  # displacement of the cylinder, size of the block
 BOTTOM, TOP = 1, 2
 E_STAR = E / (1 - NU**2)
 GAMMA = np.arctan(MU * (1 - 2 * NU) / (2 * (1 - NU))) / np.pi
@@ -49,7 +49,7 @@ HALF_WIDTH = np.sqrt(4 * P * R / (np.pi * E_STAR * (1 - 4 * GAMMA**2)))
 
 
 def sliding_pressure(x: np.ndarray) -> np.ndarray:
-    """Johnson's pressure at x from the middle of the contact, x along the way (stress)."""
+    """Return Johnson's pressure at x from the middle of the contact, along sliding (stress)."""
     a = HALF_WIDTH
     before, behind = np.clip(a + x, 0, None), np.clip(a - x, 0, None)
     skewed = before ** (0.5 - GAMMA) * behind ** (0.5 + GAMMA)
@@ -57,7 +57,7 @@ def sliding_pressure(x: np.ndarray) -> np.ndarray:
 
 
 def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """The block, ``cells`` per half-width along the way, coarser with the distance. Collective."""
+    """Mesh the block: ``cells`` per half-width at the path, coarser with distance. Collective."""
     gmsh.initialize()
     try:
         gmsh.option.setNumber("General.Terminal", 0)
@@ -98,7 +98,7 @@ def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
 def solve(
     arguments: argparse.Namespace,
 ) -> tuple[fc.ContactProblem, LinearElastic, list[dict[str, float]], dict[str, Any]]:
-    """Press, drag, and note every increment of the drag. Collective."""
+    """Press and drag, and return the results of every increment of dragging. Collective."""
     start = time.perf_counter()
     mesh, tags = make_mesh(arguments.cells)
     V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
@@ -107,7 +107,7 @@ def solve(
     held = fem.locate_dofs_topological(V, 1, tags.find(BOTTOM))
     bcs = [fem.dirichletbc(np.zeros(2), held, V)]
 
-    # The cylinder's motion along x is prescribed, the one along y follows from the force.
+    # The displacement of the cylinder is prescribed along x, and follows from the force along y.
     along, press = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
     motion = fc.Motion(displacement=(along, None), force=(None, press))
     cylinder = fc.Cylinder(point=(-WAY / 2, R), radius=R, displacement=motion)
@@ -160,7 +160,7 @@ def solve(
 
 
 def compare(path: list[dict[str, float]]) -> dict[str, Any]:
-    """The steady half of the way beside its references."""
+    """Compare the steady second half of the path with its references."""
     steady = path[len(path) // 2 :]
     column = {name: np.array([row[name] for row in steady]) for name in steady[0]}
     peak = float(sliding_pressure(np.linspace(-HALF_WIDTH, HALF_WIDTH, 2001)).max())
@@ -186,7 +186,7 @@ def compare(path: list[dict[str, float]]) -> dict[str, Any]:
 
 
 def draw(folder: Path, path: list[dict[str, float]], points: dict[str, np.ndarray]) -> None:
-    """Tractions at the end, and the forces along the way. On this rank."""
+    """Plot the tractions at the end, and the forces along the path. On this rank."""
     with plotting.figure(folder / "ironing.png", 2) as (left, right):
         x = points["x"][:, 0]
         closed = points["pressure"] > 0
@@ -227,7 +227,7 @@ def draw(folder: Path, path: list[dict[str, float]], points: dict[str, np.ndarra
 
 
 def main() -> int:
-    """Iron, and write all results; 0 if every reference is met."""
+    """Run the demo, and write all results; return 0 if every reference is met."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

@@ -1,19 +1,19 @@
-"""Rolling: a rigid disc is pressed into rubber, turns there until it slips, and is dragged along.
+"""Rolling: a rigid disc is pressed into rubber, rotated until it slips, and dragged.
 
 Plane strain, neo-Hookean (E = 1000, ν = 0.3); lengths in mm, stresses in MPa, forces per mm of
-thickness. The disc (R = 4) is pressed by 3 into a block 16 x 10, held at its bottom: by 30 % of the
-height. Then it turns by 0.8: first the block follows, then points begin to slip from the edges of
-the contact, at last all of them do. Then the disc is dragged by 2 as it is. μ = 0.3.
+thickness. The disc (R = 4) is pressed by 3, 30 % of the height, into a block 16 x 10 that is fixed
+at its bottom. Then it rotates by 0.8: first all points stick, then slip begins at the edges of the
+contact, finally all points slip. Then the disc is dragged by 2 without rotation. μ = 0.3.
 
     python demos/rolling.py
     mpirun -n 2 python demos/rolling.py
 
-References: forces and torque of GetFEM 5.4.2 on the same mesh, with the same penalty (1e4 along the
-normal, 1e3 across), where the disc has been pressed, turned and dragged (1e-7 of the force that
-presses; all increments are in verification/getfem_disc.py). A cross-check through this package:
-the block is moved to the other side instead of the disc, and the forces are the same (1e-10). And
-the torque of a disc that slips all over, R times μ times all pressure (2 %: it penetrates by p/k_n,
-up to 0.07). The exit code is 1 if one of them is missed.
+References: forces and torque of GetFEM 5.4.2 on the same mesh with the same penalty (1e4 normal,
+1e3 tangential), at the ends of pressing, rotation and dragging (1e-7 of the normal force; all
+increments are in verification/getfem_disc.py). A cross-check with this package: the block is moved
+in the opposite direction instead of the disc, and the forces are the same (1e-10). The torque at
+full slip, R times μ times the integral of the pressure (2 %: the penetration is p/k_n, up to 0.07).
+The exit code is 1 if one of them is missed.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ WIDTH, HEIGHT, CELL = 16.0, 10.0, 0.5
 DEPTH, TURN, WAY = 3.0, 0.8, 2.0
 K_N, K_T = 1e4, 1e3
 BOTTOM, TOP = 1, 2
-# Pressed until t = 1, turned until t = 2, dragged until t = 3.
+# Pressing until t = 1, rotation until t = 2, dragging until t = 3.
 TIMES = (*(np.arange(1, 13) / 12), *(1 + np.arange(1, 17) / 8))
-# Drag, force of the disc downwards and torque on the block.
+# Drag, downward force of the disc, and torque on the block, by t.
 GETFEM = {
     1.0: (0.0, 3003.797966, 0.0),
     2.0: (902.597361, 3106.755291, 4049.434181),
@@ -50,7 +50,7 @@ GETFEM = {
 
 
 def solve(moved: str) -> tuple[list[dict[str, float]], fc.ContactProblem, NeoHookean, int]:
-    """Press, turn and drag; ``moved`` along x is "disc" or "block". Collective."""
+    """Press, rotate and drag; ``moved``, "disc" or "block", is moved along x. Collective."""
     corners, n = (
         [(-WIDTH / 2, 0.0), (WIDTH / 2, HEIGHT)],
         (round(WIDTH / CELL), round(HEIGHT / CELL)),
@@ -77,7 +77,7 @@ def solve(moved: str) -> tuple[list[dict[str, float]], fc.ContactProblem, NeoHoo
     disc = fc.Cylinder(axis, R, displacement=shift, rotation=fc.Rotation(angle, about=axis))
     surface = fc.ContactSurface(mesh, tags, TOP)
     contact = fc.Contact(u, surface, disc, fc.Coulomb(MU, K_N, K_T), kinematics="finite")
-    # The rule of the second program, three points along each side of a cell.
+    # The quadrature of GetFEM: three points along each edge of a cell.
     dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 4})
     problem = fc.ContactProblem(
         rubber.residual(v, dx),
@@ -88,7 +88,7 @@ def solve(moved: str) -> tuple[list[dict[str, float]], fc.ContactProblem, NeoHoo
     )
 
     def load(t: float) -> None:
-        """Down until 1, turned until 2, dragged until 3."""
+        """Press until t = 1, rotate until 2, drag until 3."""
         along = WAY * max(t - 2.0, 0.0)
         shift.value[:] = along if moved == "disc" else 0.0, -DEPTH * min(t, 1.0)
         angle.value = TURN * float(np.clip(t - 1.0, 0.0, 1.0))
@@ -116,7 +116,7 @@ def solve(moved: str) -> tuple[list[dict[str, float]], fc.ContactProblem, NeoHoo
 
 
 def compare(path: list[dict[str, float]], other: list[dict[str, float]]) -> dict[str, Any]:
-    """The path beside GetFEM's, and beside that of the block that is moved instead."""
+    """Compare the path with GetFEM's, and with that of the moved block."""
     values, references = {}, {}
     names = ("drag", "normal", "torque")
     for row in path:
@@ -136,7 +136,7 @@ def compare(path: list[dict[str, float]], other: list[dict[str, float]]) -> dict
 
 
 def draw(file: Path, path: list[dict[str, float]]) -> None:
-    """Forces and torque, and how many points stick. On this rank."""
+    """Plot forces and torque, and numbers of sticking and slipping points. On this rank."""
     t = [row["time"] for row in path]
     with plotting.figure(file, 2) as (left, right):
         left.plot(t, [row["normal"] for row in path], ".-", label="force that presses")
@@ -157,7 +157,7 @@ def draw(file: Path, path: list[dict[str, float]]) -> None:
 
 
 def main() -> int:
-    """Roll by both routes, and write all results; 0 if every reference is met."""
+    """Solve with moved disc and moved block, write results; return 0 if every reference is met."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

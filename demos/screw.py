@@ -1,19 +1,20 @@
-"""A screw of square thread turns under a nut of rubber: torque and axial force.
+"""A square-thread screw rotates below a rubber nut: torque and axial force.
 
-The flank of the thread is a helicoid about the z-axis, z = P θ, P = lead/(2π) = 3. Of the nut there
-is one block at a mean radius R = 10, 1 wide, 2 long, 1 high, whose foot is the same helicoid: E =
-10, ν = 0.45, neo-Hookean, its top held. The screw is pressed against it by 0.05 along the axis;
-then it turns by 1.2 radians, and advances by P for each, as in a nut that stays: so loads are
-lowered. Then it turns back, as where they are raised. Lengths in mm, stresses in MPa.
+The flank of the thread is a helicoid about the z-axis, z = P θ, P = lead/(2π) = 3. The nut is
+represented by one block at the mean radius R = 10, of width 1, length 2 and height 1, whose foot is
+the same helicoid: E = 10, ν = 0.45, neo-Hookean, with a fixed top. The screw is pressed against it
+by 0.05 along the axis; then it rotates by 1.2 rad and advances by P per radian, as in a fixed nut
+when a load is lowered. Then it rotates back, as when a load is raised. Lengths in mm, stresses in
+MPa.
 
     python demos/screw.py
     python demos/screw.py --friction 0.2
 
 References: without friction the work of the torque is that of the axial force, M = F P, at every
-angle, to round-off. With friction the screw of square thread of textbooks, M = F R tan(α ± φ) with
-tan α = P/R and tan φ = μ, plus when it raises and minus when it lowers: 3e-4 of F R, for pressures
-whose middle is by a hundredth of the width off that of the block have μ/1000 of F R more or less,
-and the square of the width over R is another (1/20)²/3 of μ. The exit code is 1 if one is missed.
+angle, to round-off. With friction the textbook solution of a square-thread screw, M = F R tan(α ±
+φ) with tan α = P/R and tan φ = μ, plus for raising and minus for lowering. Its tolerance is 3e-4
+F R: a centre of pressure that is off by 0.01 of the width of the block changes the torque by
+μ F R/1000, and the finite width by another (1/20)²/3 μ F R. The exit code is 1 if one is missed.
 """
 
 from __future__ import annotations
@@ -38,14 +39,14 @@ from fenics_contact.elasticity import NeoHookean
 E, NU, R, P = 10.0, 0.45, 10.0, 3.0
 WIDTH, LENGTH, HEIGHT = 1.0, 2.0, 1.0
 DEPTH, TURN = 0.05, 1.2
-WITHIN = 3e-4  # M / (F R)
-CLEARANCE = 1e-5  # at first, by which the chords of the foot would be in the thread
-PRESSED, TURNED = 2, 12  # increments of the press, and of the turn there and of that back each
+WITHIN = 3e-4  # tolerance of M / (F R)
+CLEARANCE = 1e-5  # initial gap: without it the chords of the foot would penetrate the thread
+PRESSED, TURNED = 2, 12  # increments of pressing, and of the rotation in each direction
 FOOT, TOP = 1, 2
 
 
 def make_mesh(n: tuple[int, int, int]) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """The block, with its foot on the thread, and the tags of foot and top. Collective."""
+    """Mesh the block with its foot on the thread, and tag foot and top. Collective."""
     low, high = (R - WIDTH / 2, -LENGTH / 2, 0.0), (R + WIDTH / 2, LENGTH / 2, HEIGHT)
     mesh = dolfinx.mesh.create_box(MPI.COMM_WORLD, [low, high], n, dolfinx.mesh.CellType.hexahedron)
     sides = [
@@ -61,7 +62,7 @@ def make_mesh(n: tuple[int, int, int]) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.
 
 
 def thread(x: Any) -> Any:
-    """Distance to the flank, to first order in it (UFL)."""
+    """Return the distance to the flank, to first order in the distance (UFL)."""
     above = x[2] + CLEARANCE - P * ufl.atan2(x[1], x[0])
     return above / ufl.sqrt(1 + P**2 / (x[0] ** 2 + x[1] ** 2))
 
@@ -69,7 +70,7 @@ def thread(x: Any) -> Any:
 def solve(
     friction: float, n: tuple[int, int, int]
 ) -> tuple[list[dict[str, float]], fc.ContactProblem, NeoHookean]:
-    """Press, lower and raise; force and torque after each increment. Collective."""
+    """Press, lower and raise; return force and torque after each increment. Collective."""
     mesh, tags = make_mesh(n)
     V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
@@ -108,7 +109,7 @@ def solve(
 def compare(
     free: list[dict[str, float]], path: list[dict[str, float]], friction: float
 ) -> dict[str, Any]:
-    """Torques beside those of textbooks. On the nut they are against what turns the screw."""
+    """Compare the torques with the textbook's; those on the nut oppose those on the screw."""
     alpha, phi = np.arctan2(P, R), np.arctan(friction)
     lowered, raised = path[PRESSED + TURNED - 1], path[-1]
     values = {
@@ -127,7 +128,7 @@ def compare(
 
 
 def draw(file: Path, runs: dict[float, list[dict[str, float]]]) -> None:
-    """Torque over force and radius along the way. On this rank."""
+    """Plot torque / (force x radius) along the path. On this rank."""
     with plotting.figure(file, 2) as (left, right):
         for friction, path in runs.items():
             steps = np.arange(1, len(path) + 1)
@@ -146,7 +147,7 @@ def draw(file: Path, runs: dict[float, list[dict[str, float]]]) -> None:
 
 
 def main() -> int:
-    """Turn without friction and with it, and write all results; 0 if every reference is met."""
+    """Run without and with friction, write all results; return 0 if every reference is met."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

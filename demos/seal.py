@@ -1,25 +1,26 @@
 """Seal: a rubber ring closed by a lid, between flat plates and in a groove.
 
-Axisymmetric, neo-Hookean rubber that keeps its volume (ν = 0.4999), displacement and pressure by
-Taylor and Hood's elements; lengths in mm, stresses in MPa, forces per mm of the ring. A rigid lid
-comes down on the ring (section D = 5, mean radius 15, E = 6) by a quarter of D. The ring lies on a
-plate, and may grow and broaden; or in a groove 1.15 D wide, one rigid profile with rounded
-corners, whose outer wall it meets. All is lubricated.
+Axisymmetric, nearly incompressible neo-Hookean rubber (ν = 0.4999), Taylor-Hood elements for
+displacement and pressure; lengths in mm, stresses in MPa, forces per mm of the ring. A rigid lid
+compresses the ring (section D = 5, mean radius 15, E = 6) by a quarter of D. The ring lies on a
+plate, where it can expand freely, or in a groove of width 1.15 D, a rigid profile with rounded
+corners, whose outer wall it touches. All contacts are frictionless.
 
     python demos/seal.py
     python demos/seal.py --cells 12
     mpirun -n 2 python demos/seal.py
 
 References: for the ring between plates P. B. Lindley's formula (Compression characteristics of
-laterally-unrestrained rubber O-rings, J. Inst. Rubber Ind. 1, 1967), by the squeeze c = closing/D,
+laterally-unrestrained rubber O-rings, J. Inst. Rubber Ind. 1, 1967), with the squeeze c, the
+displacement of the lid divided by D,
 
     F = E D (1.25 c^1.5 + 50 c^6),
 
 a fit for rings, here from c = 0.15 on (5 %; a narrower contact is stiffer than any power of c); and
-Hertz for the peak under the force that is found at the first squeeze, 0.02 (3 %: the half-width is
-R/10, about a facet of the finer mesh). For both seals: lid and bed bear the same (1e-6), and cells
-of half the size change the force by less than 1 % and the peak by less than 2 %. The exit code is 1
-if one of them is missed.
+Hertz's peak pressure for the computed force at the first squeeze, 0.02 (3 %: the half-width is
+R/10, about a facet of the finer mesh). For both seals the forces on lid and bed are equal (1e-6),
+and cells of half the size change the force by less than 1 % and the peak by less than 2 %. The exit
+code is 1 if one of them is missed.
 """
 
 from __future__ import annotations
@@ -45,19 +46,19 @@ from fenics_contact.elasticity import NeoHookean
 
 D, E, NU, RING = 5.0, 6.0, 0.4999, 15.0
 R = D / 2
-WIDTH, CORNER = 1.15 * D, 0.1 * D  # of the groove; radius of its corners
+WIDTH, CORNER = 1.15 * D, 0.1 * D  # width of the groove, radius of its corners
 CLOSING = (0.02, 0.05, *(0.025 * np.arange(3, 11)))  # c at the ends of increments
 SQUEEZE = CLOSING[-1]
 RIM = 1
 
 
 def lindley(c: Any) -> Any:
-    """Force on a ring between flat plates at the squeeze c (force per length)."""
+    """Return the force on a ring between flat plates at the squeeze c (force per length)."""
     return E * D * (1.25 * c**1.5 + 50 * c**6)
 
 
 def groove() -> np.ndarray:
-    """Points down the outer wall, along the floor inwards and up the inner wall, (n, 2)."""
+    """Return points of the groove, from the outer wall to the inner wall, (n, 2)."""
     side = np.linspace(1.3 * D, CORNER, 40, endpoint=False)
     turn = np.linspace(0, np.pi / 2, 24, endpoint=False)
     floor = WIDTH / 2 - CORNER
@@ -70,15 +71,15 @@ def groove() -> np.ndarray:
 
 @dataclass
 class Run:
-    """One seal.
+    """The results for one seal.
 
     Attributes:
         squeeze: c after every increment.
-        lid, bed: Forces of the lid, downwards, and of what the ring lies on, upwards, each over
-            the ring's undeformed length (force per length).
+        lid, bed: Forces of the lid, downwards, and of plate or groove, upwards, divided by the
+            undeformed length of the ring (force per length).
         peak: Largest true pressure under the lid.
-        place: Where the points under the lid are at the end, r.
-        pressure: True pressure there.
+        place: Present radius r of the points under the lid at the end.
+        pressure: True pressure at these points.
     """
 
     name: str
@@ -96,7 +97,7 @@ class Run:
 
 
 def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """The section, ``cells`` per radius at its rim, coarser inside, curved. Collective."""
+    """Mesh the section with curved cells, ``cells`` per radius, coarser inside. Collective."""
     gmsh.initialize()
     try:
         gmsh.option.setNumber("General.Terminal", 0)
@@ -125,7 +126,7 @@ def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
 
 
 def solve(name: str, cells: int) -> Run:
-    """Close a seal. Collective."""
+    """Compress a seal, and return its results. Collective."""
     mesh, tags = make_mesh(cells)
     shape = mesh.topology.cell_name()
     displacements = basix.ufl.element("P", shape, 2, shape=(2,))
@@ -153,7 +154,7 @@ def solve(name: str, cells: int) -> Run:
         )
         for called, obstacle in (("lid", lid), ("bed", bed))
     ]
-    # Nothing but the two contacts holds the ring.
+    # Only the two contacts constrain the ring.
     problem = fc.ContactProblem(rubber.residual(v, dx, q=q), w, contacts=contacts)
 
     length = 2 * np.pi * RING
@@ -171,9 +172,9 @@ def solve(name: str, cells: int) -> Run:
 
 
 def under(contact: fc.Contact) -> tuple[np.ndarray, np.ndarray]:
-    """Present r and true pressure of the closed points by r, on all ranks. Collective."""
+    """Return present r and true pressure of closed points, sorted by r. Collective."""
     r, along = contact.points[:, 0], contact.own_displacement()[:, 0]
-    # Hoops stretch as well as the section's rim.
+    # The area stretches along the section and circumferentially.
     pressure = contact.pressure / (contact.area_stretch() * (1 + along / r))
     closed = contact.pressure > 0
     rows = MPI.COMM_WORLD.allgather(np.stack([(r + along)[closed], pressure[closed]]))
@@ -183,7 +184,7 @@ def under(contact: fc.Contact) -> tuple[np.ndarray, np.ndarray]:
 
 
 def compare(runs: list[Run]) -> dict[str, Any]:
-    """The finer mesh beside formulas, the coarser one beside it."""
+    """Compare the finer mesh with formulas, and the coarser mesh with the finer one."""
     values, references = {}, {}
     coarse, fine = runs[::2], runs[1::2]
     plates = fine[0]
@@ -191,7 +192,7 @@ def compare(runs: list[Run]) -> dict[str, Any]:
         name = f"force at c = {c:g} [N/mm]"
         values[name] = plates.lid[int(np.argmin(np.abs(np.array(plates.squeeze) - c)))]
         references[name] = (float(lindley(c)), 0.05)
-    # Two cylinders of R and ∞, one of them rigid, in plane strain: the hoops hold each other.
+    # Hertz for a cylinder of radius R on a rigid plane, in plane strain.
     star = E / (1 - NU**2)
     values["peak at c = 0.02 [MPa]"] = plates.peak[0]
     references["peak at c = 0.02 [MPa]"] = (
@@ -209,7 +210,7 @@ def compare(runs: list[Run]) -> dict[str, Any]:
 
 
 def draw(path: Path, runs: list[Run]) -> None:
-    """Force over squeeze, and pressure under the lid at the end. On this rank."""
+    """Plot force over squeeze, and pressure under the lid at the end. On this rank."""
     with plotting.figure(path, 2) as (left, right):
         at = np.linspace(0, SQUEEZE, 100)
         left.plot(at, lindley(at), "k--", label="Lindley, between plates")
@@ -226,7 +227,7 @@ def draw(path: Path, runs: list[Run]) -> None:
 
 
 def main() -> int:
-    """Close both seals on two meshes, and write all results; 0 if every reference is met."""
+    """Compress both seals on two meshes, write results; return 0 if every reference is met."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

@@ -1,9 +1,9 @@
 """Shallow ironing: an elastic die is pressed into an elastic slab and dragged far along it.
 
-Plane strain; lengths in mm, stresses in MPa, forces per mm of thickness. The slab is
-[0, 12] x [0, 4] (E = 689.6, ν = 0.32), held at its bottom. The die (E = 6896, ν = 0.32) stands 0.2
-above it: from x = 0.2 to 1.4 and from y = 4.5 to 5.4, below that an arc (R = 0.75). Its top is
-moved down by 1 until t = 1, and then along by 10 until t = 2. Both are neo-Hookean, with the energy
+Plane strain; lengths in mm, stresses in MPa, forces per mm of thickness. The slab [0, 12] x [0, 4]
+(E = 689.6, ν = 0.32) is fixed at its bottom. The die (E = 6896, ν = 0.32), 0.2 above it, extends
+from x = 0.2 to 1.4 and from y = 4.5 to 5.4, with an arc below (R = 0.75). Its top is moved down by
+1 until t = 1, then along x by 10 until t = 2. Both are neo-Hookean, with the energy
 G/2 (I1 - 3 - 2 ln J) + L/4 (J² - 1 - 2 ln J), and μ = 0.3.
 
     python demos/shallow_ironing.py
@@ -11,14 +11,13 @@ G/2 (I1 - 3 - 2 ln J) + L/4 (J² - 1 - 2 ln J), and μ = 0.3.
     mpirun -n 2 python demos/shallow_ironing.py
 
 Γc is the side of the die, whose cells are 2.5 times finer than those of the slab below it. In the
-slide all points slip, the slab's surface passes under them facet by facet, and increments are to be
-no longer than a fifth of one: of half a facet Newton's method takes 12 to 47 steps, not 5.
+second phase all points slip over the facets of the slab, and increments should be at most a fifth
+of a facet: with half a facet Newton's method takes 12 to 47 iterations instead of 5.
 
-References: V(1), V(1.5) and H(1.5), read off the curves of five programs, between whose least and
-largest values those here must be (Fischer and Wriggers, Comput. Methods Appl. Mech. Engrg. 195,
-2006; Hartmann et al.; Yastrebov; Poulios and Renard; Code_Aster). They differ by their energies,
-the height of the slab and details of the die more than by their meshes. The exit code is 1 if one
-is missed.
+References: the ranges of V(1), V(1.5) and H(1.5) in the published curves of five programs (Fischer
+and Wriggers, Comput. Methods Appl. Mech. Engrg. 195, 2006; Hartmann et al.; Yastrebov; Poulios and
+Renard; Code_Aster). These differ more because of their energies, the height of the slab and details
+of the die than because of their meshes. The exit code is 1 if a value is outside its range.
 """
 
 from __future__ import annotations
@@ -47,9 +46,9 @@ LEFT, RIGHT, SHOULDER, TOP_OF_DIE = 0.2, 1.4, 4.5, 5.4
 DOWN, ALONG = 1.0, 10.0
 SLAB, DIE = 1, 2
 BOTTOM, SURFACE, TOP, SIDE = 1, 2, 3, 4
-# Of the die's cells by those of the slab.
+# Size of the die's cells relative to the slab's.
 FINER = 0.4
-# Least and largest of the programs named above: t, name, [N/mm].
+# Smallest and largest published value by t and force [N/mm].
 PUBLISHED = {
     (1.0, "V"): (268.0, 332.0),
     (1.5, "V"): (337.0, 421.0),
@@ -59,24 +58,24 @@ PUBLISHED = {
 
 @dataclass(frozen=True)
 class Setting:
-    """What `verification/shallow_ironing.py` varies; the demo itself takes the first three.
+    """Parameters varied by `verification/shallow_ironing.py`; the demo sets the first three.
 
     Attributes:
-        size: Of the slab's cells down to 0.5 below its surface, growing from there on [mm].
-        increments: While the die is dragged until t = 2.
-        until: t at which to end.
-        pressing: Increments while the die is pressed.
-        stiffness: Multiple of E/h of the die with ``finer`` at 0.4, of which k_n and k_t are. Its E
-            is 10 times that of the slab: 1 of it is 25 E/h of the slab, where 10 is usual.
+        size: Size of the slab's cells down to 0.5 below its surface, larger ones below [mm].
+        increments: Number of increments while the die is dragged until t = 2.
+        until: Last value of t.
+        pressing: Number of increments while the die is pressed.
+        stiffness: k_n and k_t relative to E/h of the die with ``finer`` at 0.4. As its E is 10
+            times that of the slab, 1 means 25 E/h of the slab, for which 10 is usual.
         enforcement: "penalty" or "augmented".
-        degree: Of the displacement.
-        quadrature: Degree of the rule on Γc; by default the package's.
-        side: Which body carries Γc, "die" or "slab".
-        isochoric: Take the energy G/2 (J^(-2/3) I1 - 3) + K/4 (J² - 1 - 2 ln J).
-        height: Of the slab below its surface [mm].
+        degree: Polynomial degree of the displacement.
+        quadrature: Quadrature degree on Γc; by default the package's.
+        side: Body that has Γc, "die" or "slab".
+        isochoric: Whether the energy is G/2 (J^(-2/3) I1 - 3) + K/4 (J² - 1 - 2 ln J).
+        height: Height of the slab [mm].
         die: Young's modulus of the die [MPa].
-        friction: μ.
-        finer: Size of the die's cells by that of the slab's.
+        friction: Friction coefficient μ.
+        finer: Size of the die's cells relative to the slab's.
     """
 
     size: float = 0.2
@@ -98,12 +97,12 @@ class Setting:
 def make_mesh(
     size: float, height: float = HEIGHT, finer: float = FINER
 ) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags, dolfinx.mesh.MeshTags]:
-    """Both bodies in one mesh, and the tags of its cells and facets. Collective.
+    """Return both bodies in one mesh, and the tags of its cells and facets. Collective.
 
     Args:
-        size: Of the slab's cells down to 0.5 below its surface, growing from there on.
-        height: Of the slab, whose surface stays where it is.
-        finer: See `Setting`.
+        size: Size of the slab's cells down to 0.5 below its surface, larger ones below.
+        height: Height of the slab, whose surface has a fixed position.
+        finer: Size of the die's cells relative to the slab's.
     """
     gmsh.initialize()
     try:
@@ -155,7 +154,7 @@ def make_mesh(
 
 
 def ends(setting: Setting) -> list[float]:
-    """Of the increments: while it is pressed, and while it is dragged."""
+    """Return t at the ends of the increments of pressing and dragging."""
     pressed = np.linspace(0.0, 1.0, setting.pressing + 1)[1:]
     dragged = np.linspace(1.0, 2.0, setting.increments + 1)[1:]
     return [float(t) for t in (*pressed, *dragged) if t <= setting.until + 1e-9]
@@ -164,7 +163,7 @@ def ends(setting: Setting) -> list[float]:
 def solve(
     setting: Setting,
 ) -> tuple[list[dict[str, float]], fc.ContactProblem, NeoHookean, int]:
-    """Press and drag; forces after each increment. Collective."""
+    """Press and drag the die; return the forces of every increment, and the problem. Collective."""
     mesh, cells, facets = make_mesh(setting.size, setting.height, setting.finer)
     V = fem.functionspace(mesh, ("Lagrange", setting.degree, (2,)))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
@@ -179,7 +178,7 @@ def solve(
         fem.dirichletbc(value, fem.locate_dofs_topological(V, 1, facets.find(tag)), V)
         for tag, value in ((BOTTOM, bottom), (TOP, top))
     ]
-    # E/h of the stiff die, by E of the softer body and h of Γc.
+    # E/h of the stiff die relative to that with E of the softer body and h of Γc.
     unit = DIE_E / min(setting.die, SLAB_E) / FINER
     own, other = (SIDE, SURFACE) if setting.side == "die" else (SURFACE, SIDE)
     if own == SIDE:
@@ -197,7 +196,7 @@ def solve(
     problem = fc.ContactProblem(body.residual(v, dx), u, bcs=bcs, contacts=[contact])
 
     def load(t: float) -> None:
-        """Down until 1, along until 2."""
+        """Press until t = 1, drag until t = 2."""
         top.value[:] = ALONG * max(t - 1.0, 0.0), -DOWN * min(t, 1.0)
 
     path, times = [], ends(setting)
@@ -221,7 +220,7 @@ def solve(
 
 
 def compare(path: list[dict[str, float]]) -> dict[str, Any]:
-    """The forces between the least and the largest published ones."""
+    """Compare the forces with the published ranges."""
     values, references = {}, {}
     for (t, name), (least, largest) in PUBLISHED.items():
         for row in path:
@@ -233,7 +232,7 @@ def compare(path: list[dict[str, float]]) -> dict[str, Any]:
 
 
 def draw(file: Path, path: list[dict[str, float]]) -> None:
-    """Forces beside the published ones, and Newton's steps. On this rank."""
+    """Plot forces with the published ranges, and Newton iterations. On this rank."""
     t = [row["time"] for row in path]
     with plotting.figure(file, 2) as (left, right):
         curves = (("V", "C0", "V, vertical"), ("H", "C1", "H, horizontal"))
@@ -254,7 +253,7 @@ def draw(file: Path, path: list[dict[str, float]]) -> None:
 
 
 def main() -> int:
-    """Press and drag, and write all results; 0 if every reference is met."""
+    """Press and drag, and write all results; return 0 if every reference is met."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

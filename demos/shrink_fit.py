@@ -1,8 +1,8 @@
-"""Shrink fit: one ring pressed into another by its oversize; two deformable bodies against Lamé.
+"""Shrink fit: two deformable rings with interference, compared with Lamé's solution.
 
-A ring of radii 10 and 20 mm, made 0.02 mm too large outside, sits in a ring of radii 20 and 40 mm;
-both E = 210 GPa, ν = 0.3. Nothing loads them but the interference, given as a negative gap apart
-from the geometry: the meshes touch at r = 20 mm, do not match there, and stay as they are.
+A ring of radii 10 and 20 mm, with an oversize of 0.02 mm outside, sits in a ring of radii 20 and
+40 mm; both E = 210 GPa, ν = 0.3. The only load is the interference, prescribed as a negative gap
+independently of the geometry: the non-matching meshes touch at r = 20 mm and are not modified.
 
     python demos/shrink_fit.py
     python demos/shrink_fit.py --kinds "plane stress" --h 0.5
@@ -14,12 +14,13 @@ Reference: Lamé's thick rings. With the interference δ and R the common radius
 
 in plane stress, 63.000 MPa here; plane strain has E/(1-ν²) for E and ν/(1-ν) for ν, 69.231 MPa.
 Quarters of the rings are modelled, on rollers along their cuts. The exit code is 1 if the mean
-pressure or the radial displacement of a free surface misses Lamé's by more than 0.5 %, or the
+pressure or the radial displacement of a free surface differs from Lamé's by more than 0.5 %, or the
 pressure varies by more than 1 % along the joint.
 
-With ``--degree 1`` the mean pressure is as good, but it varies from point to point: between its
-nodes a linear displacement misses the circle by u h²/(8R²), which the stiffness of 100 E/h turns
-into some 50 MPa. Such elements want a ``--stiffness`` of a few E/h, and only their mean is of use.
+With ``--degree 1`` the mean pressure is as accurate, but it varies from point to point: between
+nodes a linear displacement deviates from the circle by u h²/(8R²), which the stiffness of 100 E/h
+converts to some 50 MPa. Such elements need a ``--stiffness`` of a few E/h, and only the mean is
+useful.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ TOLERANCE, EVENNESS = 0.005, 0.01
 
 
 def lame(kind: str) -> tuple[float, float, float]:
-    """Pressure of the joint, radial displacement of the bore and of the outer surface."""
+    """Return Lamé's joint pressure and radial displacements of bore and outer surface."""
     modulus, nu = (E, NU) if kind == "plane stress" else (E / (1 - NU**2), NU / (1 - NU))
     hub = ((OUTER**2 + JOINT**2) / (OUTER**2 - JOINT**2) + nu) / modulus
     shaft = ((JOINT**2 + INNER**2) / (JOINT**2 - INNER**2) - nu) / modulus
@@ -60,7 +61,7 @@ def lame(kind: str) -> tuple[float, float, float]:
 
 
 def lame_stress(r: np.ndarray, p: float) -> tuple[np.ndarray, np.ndarray]:
-    """Radial and hoop stress at the radii ``r``."""
+    """Return Lamé's radial and hoop stress at the radii ``r`` for the joint pressure ``p``."""
     inside = r <= JOINT
     a, b = np.where(inside, INNER, JOINT), np.where(inside, JOINT, OUTER)
     mean = np.where(inside, -p * b**2, p * a**2) / (b**2 - a**2)
@@ -69,7 +70,7 @@ def lame_stress(r: np.ndarray, p: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def make_mesh(h: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """Two quarter rings of curved cells, of size ``h`` and 1.31 ``h``. Collective."""
+    """Mesh two quarter rings with curved cells of size ``h`` and 1.31 ``h``. Collective."""
     gmsh.initialize()
     try:
         gmsh.option.setNumber("General.Terminal", 0)
@@ -108,7 +109,7 @@ def make_mesh(h: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
 def solve(
     arguments: argparse.Namespace, kind: str
 ) -> tuple[fc.ContactProblem, LinearElastic, dict[str, Any]]:
-    """Fit the rings together, and measure. Collective."""
+    """Apply the interference, and compare with Lamé. Collective."""
     start = time.perf_counter()
     mesh, tags = make_mesh(arguments.h)
     V = fem.functionspace(mesh, ("Lagrange", arguments.degree, (2,)))
@@ -158,7 +159,7 @@ def solve(
 
 
 def draw(folder: Path, contact: fc.Contact, body: LinearElastic, result: dict[str, Any]) -> None:
-    """Stresses over the radius and the pressure along the joint. Collective."""
+    """Plot stresses over the radius and the pressure along the joint. Collective."""
     mesh = contact.surface.mesh
     x, stress = output.sample(body.stress, mesh, 2)
     points = contact.gather()
@@ -201,7 +202,7 @@ def draw(folder: Path, contact: fc.Contact, body: LinearElastic, result: dict[st
 
 
 def main() -> int:
-    """Fit the rings in each kind; 0 if every reference is met."""
+    """Run all kinds, plane stress or strain; return 0 if every reference is met."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

@@ -4,7 +4,7 @@ Lengths in mm, stresses in MPa: steel, E = 210e3 and ν = 0.3, E* = E/(1-ν²), 
 frictionless; quarters by symmetry, quadratic tetrahedra that grow with the distance from the
 contact.
 
-- "block": a rigid ball is moved by d into an elastic block, which is held 400 contact radii away.
+- "block": a rigid ball is moved by d into an elastic block, which is fixed 400 contact radii away.
 - "ball": the lower half of an elastic ball is moved by d, at its equator, onto a rigid plane.
 
     python demos/sphere.py
@@ -15,13 +15,13 @@ Reference: Hertz. With the approach d of points far from the contact
 
     a = √(R d),    F = 4/3 E* √R d^{3/2},    p₀ = 3F/(2πa²),    p(r) = p₀ √(1 - r²/a²).
 
-He takes a/R for small. With d = 5e-5, a twentieth of a micrometre, it is 0.007, F is 0.11 N, and p₀
-1.04 GPa, at which hard steel stays elastic. With ``--depth 0.01`` it is 0.1, and what he leaves out
-makes 2 % of the force (p₀ is 14.7 GPa then, which no steel bears). The block is compared with these
-functions of the depth. Half a ball is stiffer than the half-space that Hertz takes it for, again by
-some a/R: there the radius and the peak are compared with those of the computed force,
-a = (3FR/(4E*))^{1/3}. Any consistent units will do. The exit code is 1 if force, radius or peak
-miss by more than 2 %.
+The theory assumes a small a/R. With d = 5e-5, a twentieth of a micrometre, a/R is 0.007, F is
+0.11 N, and p₀ 1.04 GPa, at which hard steel is elastic. With ``--depth 0.01`` a/R is 0.1, and the
+error of the theory is 2 % of the force (p₀ is 14.7 GPa, above the strength of any steel). The block
+is compared with these functions of the depth. A half ball is stiffer than Hertz's half-space, again
+by about a/R: its radius and peak are compared with those for the computed force,
+a = (3FR/(4E*))^{1/3}. Any consistent units can be used. The exit code is 1 if force, radius or peak
+differ by more than 2 %.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ from fenics_contact.elasticity import LinearElastic
 
 R, E, NU = 1.0, 210e3, 0.3
 E_STAR = E / (1 - NU**2)
-FAR = 400  # size of the block over the contact radius
+FAR = 400  # size of the block relative to the contact radius
 AT_X, AT_Y, HELD, CONTACT = 1, 2, 3, 4  # facets: the planes of symmetry, the far end, Γc
 TOLERANCE = 0.02
 
 
 def make_mesh(case: str, a: float, cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """Quarter of the block below z = 0, or of the half ball above it; fine at the origin.
+    """Mesh a quarter of the block below z = 0, or of the half ball above, fine at the origin.
 
     Cells have the size a/``cells`` up to 1.3 a, and grow with the distance beyond. Collective.
     """
@@ -76,7 +76,7 @@ def make_mesh(case: str, a: float, cells: int) -> tuple[dolfinx.mesh.Mesh, dolfi
                     groups[AT_X].append(face)
                 elif high[1] < tight:
                     groups[AT_Y].append(face)
-                else:  # the block touches with its flat face, the ball with its round one
+                else:  # Γc is the flat face of the block, or the round face of the ball
                     groups[CONTACT if flat == (case == "block") else HELD].append(face)
             for tag, faces in groups.items():
                 gmsh.model.addPhysicalGroup(2, faces, tag)
@@ -94,7 +94,7 @@ def make_mesh(case: str, a: float, cells: int) -> tuple[dolfinx.mesh.Mesh, dolfi
 
 
 def hertz(case: str, depth: float, force: float) -> dict[str, float]:
-    """Force, radius and peak pressure by Hertz: of the depth, or for the ball of the force."""
+    """Return Hertz's force, radius and peak for the depth, or for the ball's computed force."""
     if case == "ball":
         a = (0.75 * force * R / E_STAR) ** (1 / 3)
         return {"radius [mm]": a, "peak pressure [MPa]": 1.5 * force / (np.pi * a**2)}
@@ -106,7 +106,7 @@ def hertz(case: str, depth: float, force: float) -> dict[str, float]:
 def solve(
     arguments: argparse.Namespace, case: str
 ) -> tuple[fc.ContactProblem, LinearElastic, dict[str, Any]]:
-    """Press, and measure; all of the forces by four times those on the quarter. Collective."""
+    """Press, and compare with Hertz; forces are four times those on the quarter. Collective."""
     start = time.perf_counter()
     mesh, tags = make_mesh(case, np.sqrt(R * arguments.depth), arguments.cells)
     V = fem.functionspace(mesh, ("Lagrange", arguments.degree, (3,)))
@@ -157,7 +157,7 @@ def solve(
 
 
 def draw(path: Path, runs: list[tuple[dict[str, Any], dict[str, np.ndarray]]]) -> None:
-    """Pressure at all points over the distance from the axis, beside Hertz's. On this rank."""
+    """Plot computed and Hertz's pressure over the distance from the axis. On this rank."""
     with plotting.figure(path, len(runs)) as axes:
         for ax, (result, points) in zip(np.atleast_1d(axes), runs, strict=True):
             exact = hertz(result["case"], result["depth"], result["force"])
@@ -183,7 +183,7 @@ def draw(path: Path, runs: list[tuple[dict[str, Any], dict[str, np.ndarray]]]) -
 
 
 def main() -> int:
-    """Press in each case; 0 if every reference is met."""
+    """Run all cases; return 0 if every reference is met."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

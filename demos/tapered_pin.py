@@ -1,35 +1,35 @@
-"""Tapered pin: pressed into a hub, released, pulled out; and what oil in the joint changes.
+"""Tapered pin: pressed into a hub, released and pulled out, dry and lubricated.
 
-Axisymmetric, lengths in mm, stresses in MPa, forces in N. A solid pin of steel stands in the taper
-1:50 of a thick hub of steel (slope of the flanks t = tan α = 0.01, mean radius 10, length 40,
-outer radius 30), without pressure. It is driven in by s = 2, until its ends are level with those of
-the hub: its flank passes over several facets of the bore, by which it comes to oversize s t = 0.02.
+Axisymmetric, lengths in mm, stresses in MPa, forces in N. A solid steel pin stands in the taper
+1:50 of a thick steel hub (slope of the flanks t = tan α = 0.01, mean radius 10, length 40, outer
+radius 30), without pressure. It is driven in by s = 2, until its ends are level with those of the
+hub: its flank slides over several facets of the bore and reaches the interference s t = 0.02.
 
     python demos/tapered_pin.py
     python demos/tapered_pin.py --slope 0.02 --oil 0.01
     mpirun -n 2 python demos/tapered_pin.py
 
-Three histories: dry (μ = 0.15 > t), both ends of the pin led in, and back until the pin is out;
-dry, pushed by a force, half of it on each end, that is taken away again; and the same with oil
-between pin and hub (μ = 0.005 < t), as it is injected to take such joints apart.
+Three histories: dry (μ = 0.15 > t) with prescribed displacements of both ends of the pin, in, and
+back until the pin is out; dry with a force, half of it on each end, that is applied and removed;
+and the same with oil between pin and hub (μ = 0.005 < t), which is injected to separate joints.
 
-References: Lamé's thick rings, slice by slice along the taper. The ends of the hub are on rollers,
-plane strain. The pin's ends are led (plane strain) or free (plane stress): friction strains the
-pin, but as much to the one side of its middle as to the other, so the mean over the joint holds.
-The pressure itself leans, with dry friction by an eighth at the ends. With Q the radial force on
-all of the joint, the pressure times its area is Q / (cos α (1 ∓ μ t)), the upper sign pushed in,
-and the forces are
+References: Lamé's thick rings, applied to slices along the taper. The ends of the hub are on
+rollers (plane strain); those of the pin are prescribed (plane strain) or free (plane stress).
+Friction strains the pin antisymmetrically about its middle, which does not change the mean over the
+joint; the pressure varies along the joint, with dry friction by an eighth at the ends. With Q the
+radial force on the whole joint, pressure times area is Q / (cos α (1 ∓ μ t)), the upper sign for
+insertion, and the forces are
 
     in: Q tan(φ + α),    out: Q tan(φ - α),    tan φ = μ.
 
-So with μ > t the pin stays when the push is released, and has to be pulled. With
-μ < t this is negative: only a push of more than tan(α - φ) / tan(α + φ), a third of the first,
-holds the pin, and as the push gets less it comes out in proportion to it, all the way.
+With μ > t the pin remains when the force is removed, and must be pulled. With μ < t the extraction
+force is negative: only a push of more than tan(α - φ) / tan(α + φ), a third of the insertion force,
+keeps the pin in, and below it the pin comes out in proportion to the force.
 
-Lamé's slices hold where pin and hub are level, at the end of the way in; there they are met to
-0.5 %: the axial displacements of the flanks make 0.2 % of the interference, cells and penalty
-0.1 %. On the way there the bare ends, each as long as e, are still loaded by their neighbours, and
-the joint is stiffer by up to e over its length. The exit code is 1 if a reference is missed.
+Lamé's slices are valid if pin and hub are level, at the end of the insertion; there the tolerance
+is 0.5 %: axial displacements of the flanks change the interference by 0.2 %, cells and penalty by
+0.1 %. Before, each of the uncovered ends, of length e, is loaded by the adjacent material, and the
+joint is stiffer by up to e over its length. The exit code is 1 if a reference is missed.
 """
 
 from __future__ import annotations
@@ -54,18 +54,18 @@ from fenics_contact.elasticity import LinearElastic
 E, NU, OVERSIZE = 210e3, 0.3, 0.02
 R, OUTER, LENGTH = 10.0, 30.0, 40.0
 BOTTOM, TOP, INSIDE, OUTSIDE = 1, 2, 3, 4
-TURNING = 0.006  # shares of the way in in which friction turns round
+TURNING = 0.006  # displacement of a friction reversal, relative to the insertion
 BITS = 6
 
 
 @dataclass(frozen=True)
 class Joint:
-    """Lamé's slices of a joint.
+    """The reference solution of a joint by Lamé's slices.
 
     Attributes:
-        slope: tan α.
-        friction: μ.
-        free_ends: Of the pin: plane stress; else plane strain.
+        slope: Slope of the flanks, tan α.
+        friction: Friction coefficient μ.
+        free_ends: Whether the ends of the pin are free: plane stress, otherwise plane strain.
     """
 
     slope: float
@@ -74,29 +74,32 @@ class Joint:
 
     @property
     def way(self) -> float:
-        """That makes the oversize (length)."""
+        """The insertion that produces the full interference (length)."""
         return OVERSIZE / self.slope
 
     def lame(self, s: float, z: np.ndarray) -> np.ndarray:
-        """Radial traction between pin and hub at the heights ``z`` (stress)."""
+        """Return the radial traction between pin and hub at the heights ``z`` (stress)."""
         r = R + self.slope * (z - LENGTH / 2)
-        modulus, nu = E / (1 - NU**2), NU / (1 - NU)  # of plane strain
+        modulus, nu = E / (1 - NU**2), NU / (1 - NU)  # for plane strain
         hub = ((OUTER**2 + r**2) / (OUTER**2 - r**2) + nu) / modulus
         pin = (1 - NU) / E if self.free_ends else (1 - nu) / modulus
         return s * self.slope / (r * (hub + pin))
 
     def pressure(self, s: float, z: np.ndarray, way: int) -> np.ndarray:
-        """Normal to the flank: pushed in (``way`` 1) friction bears a part of it, out (-1) adds."""
+        """Return the pressure on the flank in insertion (``way`` 1) or extraction (-1) (stress)."""
         return self.lame(s, z) / (1 - way * self.friction * self.slope)
 
     def mean_pressure(self, s: float, way: int) -> float:
-        """Over the joint's area."""
+        """Return the mean pressure over the area of the joint (stress)."""
         z = np.linspace(0, LENGTH, 201)
         r = R + self.slope * (z - LENGTH / 2)
         return float(np.trapezoid(r * self.pressure(s, z, way), z) / np.trapezoid(r, z))
 
     def force(self, s: float, way: int) -> float:
-        """On the pin after the way ``s``: a push is positive, ``way`` as above (force)."""
+        """Return the force on the pin at the insertion ``s``; a push is positive (force).
+
+        ``way`` is 1 for insertion and -1 for extraction.
+        """
         z = np.linspace(0, LENGTH, 201)
         r = R + self.slope * (z - LENGTH / 2)
         covered = 1 - (self.way - s) / LENGTH
@@ -104,21 +107,21 @@ class Joint:
         return radial * self.tangent(way)
 
     def tangent(self, way: int) -> float:
-        """tan(α ± φ): force along over radial force."""
+        """Return the ratio tan(α ± φ) of axial to radial force."""
         t, m = self.slope, way * self.friction
         return (t + m) / (1 - t * m)
 
 
 @dataclass
 class Scene:
-    """Pin and hub, their contact, and what has been found of them.
+    """Pin and hub, their contact, and the results.
 
     Attributes:
-        joint: Its reference.
-        way: How far the ends of the pin are led (length).
-        traction: On both ends of the pin, downwards (stress).
-        path: Load parameter, way and push after every increment; a pull is negative.
-        pressures: By name, heights of the points of the joint at its ends, and their pressure.
+        joint: The reference solution.
+        way: Prescribed axial displacement of the ends of the pin (length).
+        traction: Traction on both ends of the pin, downwards (stress).
+        path: Load parameter, insertion and push after every increment; a pull is negative.
+        pressures: By name, heights of the points of the joint, and their pressure.
     """
 
     joint: Joint
@@ -133,7 +136,10 @@ class Scene:
     dissipation: float = 0.0
 
     def lead(self, steps: list[float]) -> None:
-        """Go on to the ways ``steps`` (ends led), or to these shares of the push. Collective."""
+        """Solve increments that end at ``steps``. Collective.
+
+        These are insertions, or, with free ends, fractions of the full insertion force.
+        """
         joint, contact = self.joint, self.problem.contacts[0]
         area = np.pi * sum(
             (R + joint.slope * (z - LENGTH / 2)) ** 2 for z in (joint.way, joint.way + LENGTH)
@@ -150,7 +156,7 @@ class Scene:
         words = f"μ = {joint.friction:g}, {'force' if joint.free_ends else 'way'}"
         history = fc.increments(self.problem, load, start, steps[-1], steps=steps, progress=words)
         for step in history:
-            # Friction strains both halves of the pin, one as much as the other.
+            # Friction strains the pin antisymmetrically: the mean does not change.
             ends = [
                 output.at_node(self.problem.u, (0.0, z))[1] for z in (joint.way, joint.way + LENGTH)
             ]
@@ -160,7 +166,7 @@ class Scene:
             self.dissipation += step.energy.dissipation
 
     def keep(self, name: str) -> None:
-        """Keep the pressure along the joint as it is now. Collective."""
+        """Store the present pressure along the joint. Collective."""
         points = self.problem.contacts[0].gather()
         order = np.argsort(points["x"][:, 1])
         z, pressure = points["x"][order, 1] - self.path[-1][1], points["pressure"][order]
@@ -169,7 +175,7 @@ class Scene:
         self.mean_pressure[name] = float(points["pressure"] @ points["measure"] / area)
 
     def at(self, load: float) -> tuple[float, float]:
-        """Way and push when the load parameter was last ``load``."""
+        """Return insertion and push at the last time that the load parameter was ``load``."""
         return next((s, f) for q, s, f in reversed(self.path) if abs(q - load) < 1e-9)
 
 
@@ -178,7 +184,7 @@ def block(
     heights: tuple[float, float],
     cells: tuple[int, int],
 ) -> tuple[dolfinx.mesh.Mesh, None, dolfinx.mesh.MeshTags]:
-    """A section between two flanks, each a radius at z = LENGTH/2 and a slope. Collective."""
+    """Mesh a section between two flanks, each a radius at z = LENGTH/2 and a slope. Collective."""
     low, high = heights
     mesh = dolfinx.mesh.create_rectangle(
         MPI.COMM_WORLD, [(0, low), (1, high)], cells, dolfinx.mesh.CellType.quadrilateral
@@ -194,9 +200,9 @@ def block(
 
 
 def make(joint: Joint, cells: int) -> Scene:
-    """Pin and hub as they touch, the pin higher by the way it has to go. Collective."""
-    # Cells of the pin, which has Γc, are half as long as those of the hub: of equal ones the
-    # pressures scatter three times as much.
+    """Create pin and hub at first contact, the pin higher by the full insertion. Collective."""
+    # Cells of the pin, which has Γc, are half as long as those of the hub: with equal cells the
+    # pressure scatters three times as much.
     flank, finer = (R, joint.slope), round(2.1 * cells)
     parts = {
         "hub": block((flank, (OUTER, 0.0)), (0.0, LENGTH), (6, cells)),
@@ -206,7 +212,7 @@ def make(joint: Joint, cells: int) -> Scene:
     mesh = joined.mesh
     V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
-    # Small strains, as Lamé has them: a body that is moved along its axis is the same for them.
+    # Small strains, as in Lamé's solution: the axial rigid-body motion of the pin does not matter.
     steel = LinearElastic(u, E, NU, "axisymmetric")
     way, traction = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
     ends = tuple(joined.facet("pin", tag) for tag in (BOTTOM, TOP))
@@ -227,8 +233,8 @@ def make(joint: Joint, cells: int) -> Scene:
         u,
         fc.ContactSurface(mesh, joined.facets, joined.facet("pin", OUTSIDE)),
         fc.DeformableBody(joined.facets, joined.facet("hub", INSIDE)),
-        # Springs of 10 E/h would take 1 % off the interference; soft ones along the joint give way
-        # by less than a micrometre, and friction that turns round takes fewer steps.
+        # A normal stiffness of 10 E/h would reduce the interference by 1 %. The low tangential one
+        # yields by less than 1 µm, and friction reversals need fewer increments.
         fc.Coulomb(joint.friction, fc.RelativeStiffness(100), fc.RelativeStiffness(1)),
         kinematics="finite",
         weight=steel.weight,
@@ -238,9 +244,9 @@ def make(joint: Joint, cells: int) -> Scene:
 
 
 def led(joint: Joint, cells: int) -> Scene:
-    """In, back, and out. Collective."""
+    """Press the pin in and pull it out by prescribed displacements. Collective."""
     scene, s = make(joint, cells), joint.way
-    # Increments of a fifth of a facet; where friction turns round, of a thousandth of the way.
+    # Increments of a fifth of a facet; during the friction reversal, of 0.001 of the insertion.
     number = 2 * int(np.ceil(s / (0.4 * LENGTH / cells)))
     way_in = [s * i / number for i in range(1, number + 1)]
     scene.lead(way_in)
@@ -252,9 +258,9 @@ def led(joint: Joint, cells: int) -> Scene:
 
 
 def forced(joint: Joint, cells: int) -> Scene:
-    """By a force on the pin, which is taken away again. Collective.
+    """Press the pin in by a force and remove the force. Collective.
 
-    Load parameters are shares of the push that brings the pin in.
+    Load parameters are fractions of the full insertion force.
     """
     scene = make(joint, cells)
     scene.lead([0.1 * i for i in range(1, 11)])
@@ -263,16 +269,16 @@ def forced(joint: Joint, cells: int) -> Scene:
         scene.lead([0.75, 0.5, 0.25, 0.0])
     else:
         hold = joint.tangent(-1) / joint.tangent(1)
-        # A tenth more than holds the pin; then less, evenly.
+        # From a tenth above the holding force to zero in equal steps.
         scene.lead([1.1 * hold, *(hold * i / 10 for i in range(9, -1, -1))])
     return scene
 
 
 def compare(dry: Scene, pushed: Scene, oiled: Scene) -> dict[str, Any]:
-    """What was found beside Lamé and Coulomb."""
+    """Compare the results with Lamé's and Coulomb's."""
     entries: dict[str, tuple[float, float, float]] = {}  # value, reference, tolerance
     joint, s = dry.joint, dry.joint.way
-    # Of both ends that are not covered yet, over the joint's length.
+    # Length of each uncovered end at half depth, relative to the length of the joint.
     bare = s / 2 / LENGTH
     for name, way in (("pushed", 1), ("pulled", -1)):
         at = s if way == 1 else s * (1 - 2 * TURNING)
@@ -281,7 +287,7 @@ def compare(dry: Scene, pushed: Scene, oiled: Scene) -> dict[str, Any]:
         entries[f"mean pressure, {motion} [MPa]"] = (value, joint.mean_pressure(at, way), 0.005)
         value = abs(dry.at(at)[1])
         entries[f"dry, {motion} force [N]"] = (value, abs(joint.force(at, way)), 0.005)
-        # The last time, on the way back; so the first on the way in.
+        # At half depth: the first such increment in insertion, the last one in extraction.
         rows = dry.path if way == 1 else dry.path[::-1]
         value = next(abs(f) for q, _, f in rows if abs(q - s / 2) < 1e-9)
         entries[f"dry, {motion} force at half depth [N]"] = (
@@ -315,7 +321,7 @@ def compare(dry: Scene, pushed: Scene, oiled: Scene) -> dict[str, Any]:
         name = f"lubricated: relative depth, {share:g} of the holding force"
         entries[name] = (oiled.at(hold * share)[0] / way, share, (1 - share) * s / LENGTH)
     entries["lubricated: relative depth after release"] = (oiled.at(0.0)[0] / way, 0.0, 1e-6)
-    # Where cells of both do not match, stiff springs scatter from point to point.
+    # Between non-matching cells a stiff penalty makes the pressure scatter from point to point.
     z, pressure = oiled.pressures["pushed"]
     share = pressure / oiled.joint.pressure(s, z, 1)
     tenths = [share[np.floor(10 * z / LENGTH) == i].mean() for i in range(1, 9)]
@@ -328,7 +334,7 @@ def compare(dry: Scene, pushed: Scene, oiled: Scene) -> dict[str, Any]:
 
 
 def draw(path: Path, dry: Scene, pushed: Scene, oiled: Scene) -> None:
-    """Pressure along the joint, and forces over the way. On this rank."""
+    """Plot pressure along the joint, and forces over insertion. On this rank."""
     joint, s = dry.joint, dry.joint.way
     z = np.linspace(0, LENGTH, 200)
     x = np.linspace(0, s, 100)
@@ -363,7 +369,7 @@ def draw(path: Path, dry: Scene, pushed: Scene, oiled: Scene) -> None:
 
 
 def main() -> int:
-    """Press the pin in and get it out three times; 0 if every reference is met."""
+    """Press the pin in and out in three cases; return 0 if every reference is met."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

@@ -1,28 +1,28 @@
-"""Tube: pinched by two round bars until its inside closes, and touches itself.
+"""Tube: pinched by two round bars until its inside closes, with self-contact.
 
 Plane strain, neo-Hookean rubber (E = 3, ν = 0.45); lengths in mm, stresses in MPa, forces per mm of
 the tube. A tube of mean radius R = 10 and thickness t = 2 is pinched, as in a valve, by two rigid
-bars of radius 4, one from above and one from below, without friction. It becomes an eight, and its
-inside closes in the middle; from then on the bars press wall on wall. All of the inside is Γc and
-opposite at once: each point looks along its present normal for what of the same wall it may meet.
+bars of radius 4, one from above and one from below, without friction. It takes the shape of an
+eight, and its inside closes in the middle; then the bars press wall on wall. The whole inside is Γc
+and its own obstacle: the opposite point is found on the same wall along the present normal.
 
     python demos/tube.py
     python demos/tube.py --cells 6
     mpirun -n 2 python demos/tube.py
 
-References. A cross-check: a quarter of the tube, whose inside is pressed on the plane of symmetry
-as on a rigid half-space. In the whole tube both walls have points and springs, and each spring is
-as long as both go in each other: a quarter of the stiffness gives the same pressure. Forces of the
-bars and of wall on wall are those of the quarter (1e-3: normals of walls that are not flat do not
-end at mirror images), and the quarter's those in cells of half the size (1 %). At the first
-pinch there is Winkler's curved beam under two opposite forces (S. Timoshenko, Strength of
-Materials; Roark's table of rings), whose middle line becomes lower and wider by
+References. The forces of the bars and between the walls are compared with a quarter of the tube,
+whose inside is pressed on the plane of symmetry as on a rigid half-space (1e-3: normals of curved
+walls do not end at mirror points). In the whole tube both walls have penalty springs, which
+penetrate by twice the amount: a quarter of the stiffness gives the same pressure. The quarter is
+compared with cells of half the size (1 %). The first increment is compared with Winkler's curved
+beam under two opposite forces (S. Timoshenko, Strength of Materials; Roark's table of rings), whose
+middle line becomes lower and wider by
 
     F R²/(E' t e) (π k₁/4 - 2 k₂²/π)    and    F R²/(E' t e) (k₁/2 - k₂ + 2 k₂²/π),
 
 k₂ = 1 - e/R, k₁ = k₂ + 6/5 E'/G e/R, e = R - t/ln(outer/inner), E' = E/(1 - ν²) (1.5 %: half of
-(t/R)², as sections do not stay plane, and what 1 % of the radius changes). The exit code is 1 if
-one of them is missed.
+(t/R)², as sections do not stay plane, and an effect of the finite displacement of 1 % of R). The
+exit code is 1 if a reference is missed.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ from fenics_contact.elasticity import NeoHookean
 
 E, NU, R, T, BAR = 3.0, 0.45, 10.0, 2.0, 4.0
 INNER, OUTER = R - T / 2, R + T / 2
-AROUND = 6  # cells around a quarter, by those through the wall
-K = 20.0  # of the springs to the bars, and of the quarter to the plane [N/mm³]
-# By both bars together, at the ends of increments; those that are compared.
+AROUND = 6  # cells around a quarter, relative to those through the wall
+K = 20.0  # penalty stiffness of the bars, and of the quarter on the plane [N/mm³]
+# Approach of the bars at the ends of increments, and the values that are compared.
 CLOSING = (0.1, *(float(c) for c in range(2, 18, 2)), 17.0, 17.5, 18.0, 18.5, 19.0)
 SHOWN = (10.0, 18.5, 19.0)
 ROUTES, CELLS, BEAM = 1e-3, 0.01, 0.015
@@ -57,7 +57,7 @@ WALL, RIM, LEVEL, UPRIGHT = 1, 2, 3, 4
 
 
 def slopes() -> tuple[float, float]:
-    """How much the middle line becomes lower and wider, by the force (length²/force)."""
+    """Return Winkler's vertical and horizontal compliance of the middle line (length²/force)."""
     modulus, shear = E / (1 - NU**2), E / (2 * (1 + NU))
     e = R - T / np.log(OUTER / INNER)
     k2 = 1 - e / R
@@ -69,16 +69,17 @@ def slopes() -> tuple[float, float]:
 
 @dataclass
 class Run:
-    """A tube, or a quarter of it.
+    """The results of a whole tube, or of a quarter of it.
 
     Attributes:
-        name: In words.
-        share: Of what each bar meets that is there: 1, or 1/2.
-        closing: Of the bars after every increment (length).
-        force: Of each bar on all of the tube (force/length).
-        inside: What wall and wall bear of it (force/length).
-        lower, wider: By how much its middle line is (length).
-        place, pressure: Of the wall at the end: x, and pressure there per undeformed area.
+        name: Name of the model.
+        share: Modelled fraction of the force of each bar: 1, or 1/2.
+        closing: Approach of the bars after every increment (length).
+        force: Force of each bar on the whole tube (force/length).
+        inside: Contact force between the walls (force/length).
+        lower, wider: Change of height and width of the middle line (length).
+        place, pressure: Present x of the points of the inner wall at the end, and pressure per
+            undeformed area.
     """
 
     name: str
@@ -97,7 +98,7 @@ class Run:
 
 
 def make_mesh(cells: int, quarters: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """The section, ``cells`` through its wall, curved; one quarter or all four. Collective."""
+    """Mesh one or four quarters of the section, curved, ``cells`` through the wall. Collective."""
     gmsh.initialize()
     try:
         gmsh.option.setNumber("General.Terminal", 0)
@@ -139,7 +140,7 @@ def make_mesh(cells: int, quarters: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mes
 
 
 def solve(name: str, cells: int, quarters: int) -> Run:
-    """Pinch a tube, or a quarter of it. Collective."""
+    """Pinch a tube or a quarter of it, and return the results. Collective."""
     mesh, tags = make_mesh(cells, quarters)
     V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
@@ -163,7 +164,7 @@ def solve(name: str, cells: int, quarters: int) -> Run:
         fc.Contact(u, rim, obstacle, fc.Frictionless(K), kinematics="finite", name=called)
         for called, obstacle in obstacles.items()
     ]
-    # Nothing moves aside where x = 0: of the whole tube that is what holds it.
+    # u_x = 0 at x = 0, which constrains the horizontal rigid-body mode of the whole tube.
     bcs = [held(UPRIGHT, 0)]
     if quarters == 1:
         bcs.append(held(LEVEL, 1))
@@ -181,7 +182,7 @@ def solve(name: str, cells: int, quarters: int) -> Run:
         run.closing.append(step.load)
         run.iterations.append(step.iterations)
         run.force.append(-float(contacts[0].resultants().force[1]) / share)
-        # Both walls of the whole tube have half of the pressure.
+        # In the whole tube each of the two walls carries half of the pressure.
         run.inside.append(inside.resultants().normal_force / share)
         run.lower.append(-2 * float(output.at_node(u, (0.0, R))[1]))
         run.wider.append(2 * float(output.at_node(u, (R, 0.0))[0]))
@@ -192,7 +193,7 @@ def solve(name: str, cells: int, quarters: int) -> Run:
 
 
 def compare(whole: Run, quarter: Run, fine: Run) -> dict[str, Any]:
-    """The whole tube beside its quarter, and that beside itself in finer cells and Winkler."""
+    """Compare the whole tube with its quarter and Winkler, and the quarter with finer cells."""
     values, references = {}, {}
     for c in SHOWN:
         i = CLOSING.index(c)
@@ -210,7 +211,7 @@ def compare(whole: Run, quarter: Run, fine: Run) -> dict[str, Any]:
 
 
 def draw(path: Path, whole: Run, quarter: Run) -> None:
-    """Force over closing, and pressure of wall on wall at the end. On this rank."""
+    """Plot force over approach, and the self-contact pressure at the end. On this rank."""
     with plotting.figure(path, 2) as (left, right):
         left.plot(whole.closing, whole.force, ".-", label="bars")
         left.plot(whole.closing, whole.inside, ".-", label="wall on wall")
@@ -231,7 +232,7 @@ def draw(path: Path, whole: Run, quarter: Run) -> None:
 
 
 def main() -> int:
-    """Pinch tube and quarters, and write all results; 0 if every reference is met."""
+    """Pinch tube and quarters, and write all results; return 0 if every reference is met."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

@@ -1,14 +1,14 @@
-"""Two cylinders, pressed and then sheared: partial slip after Cattaneo and Mindlin.
+"""Two cylinders, pressed and then sheared: partial slip according to Cattaneo and Mindlin.
 
 Two half-cylinders, R = 8 mm, E = 200 MPa, ν = 0.3, plane strain, μ = 0.2, both deformable, with
-meshes that do not match. The lower one is clamped along its flat face. The upper one is held by
-contact alone: a uniform pressure of 0.625 MPa on its flat face presses it on (P = 10 N/mm), then a
-shear traction of 0.05851 MPa there (Q = 0.936 N/mm) pulls it along x, with a traction across that
-is linear in x and takes the moment of the shear about the contact.
+non-matching meshes. The lower one is fixed at its flat face. The upper one is constrained by
+contact alone: a uniform pressure of 0.625 MPa on its flat face (P = 10 N/mm), then a shear traction
+of 0.05851 MPa there (Q = 0.936 N/mm) along x, with a normal traction that is linear in x and
+balances the moment of the shear about the contact.
 
-The theory starts from a contact free of shear, as symmetry makes it. So friction is switched on
-after pressing; before, rollers along the axis x = 0 keep the upper body upright. The two phases are
-two problems, with conditions of their own, on one contact, which carries the history.
+The theory starts from a contact without shear, as in a symmetric problem. Friction is therefore
+introduced after pressing; before, rollers on the axis x = 0 constrain the upper body. The two
+phases are two problems with different Dirichlet conditions and one contact, which has the history.
 
     python demos/two_cylinders.py
     python demos/two_cylinders.py --cells 40 --increments 20
@@ -18,9 +18,10 @@ Reference: Hertz for the pressure, a = 0.68078 mm and p₀ = 9.3514 MPa; and for
 
     q(x) = μ p₀ [√(1 - x²/a²) - (c/a) √(1 - x²/c²)],    c/a = √(1 - Q/(μP)) = 0.72933,
 
-where the second term is left out beyond c: the contact sticks in |x| < c and slips around it. Half
-cylinders are no half-planes; a/R = 0.085. The exit code is 1 if the half-widths of contact and
-stick zone, or the largest pressure and shear, miss by more than 2 %, or the forces their loads.
+where the second term is zero for |x| > c: the contact sticks in |x| < c and slips elsewhere. The
+theory is for half-planes; here a/R = 0.085. The exit code is 1 if the half-widths of contact and
+stick zone, or the largest pressure and shear, differ by more than 2 %, or the forces from the loads
+by more than 1e-7.
 """
 
 from __future__ import annotations
@@ -55,15 +56,15 @@ TOLERANCE, EQUILIBRIUM = 0.02, 1e-7
 
 
 def cattaneo(x: np.ndarray) -> np.ndarray:
-    """Shear traction at the places ``x``."""
+    """Return the reference shear traction at the positions ``x``."""
     full = np.sqrt(np.maximum(0, 1 - (x / A) ** 2))
     return FRICTION * PEAK * (full - C / A * np.sqrt(np.maximum(0, 1 - (x / C) ** 2)))
 
 
 def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """Half-discs above and below the origin, curved cells; a/``cells`` at the contact. Collective.
+    """Mesh half-discs above and below the origin, with curved cells. Collective.
 
-    Facets within 1.5 a of the origin are those that may touch.
+    Cells have the size a/``cells`` at the contact. Facets within 1.5 a of the origin may touch.
     """
     gmsh.initialize()
     try:
@@ -107,13 +108,13 @@ def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
 
 @dataclass
 class Pressed:
-    """The cylinders, pressed on each other and ready to be sheared.
+    """The cylinders after pressing, before the shear load.
 
     Attributes:
-        problem, contact, body: The parts of the problem.
+        problem, contact, body: Problem, contact and elastic law.
         shear: The shear traction on the upper flat face (MPa).
-        deflection: Form of the displacement that this shear does its work on (mm).
-        step: What pressing took.
+        deflection: Form of the displacement that is conjugate to the shear force (mm).
+        step: The step of pressing.
     """
 
     problem: fc.ContactProblem
@@ -125,7 +126,7 @@ class Pressed:
 
 
 def press(cells: int, degree: int, stiffness: float) -> Pressed:
-    """Build the cylinders and press them, free of shear. Collective."""
+    """Create the cylinders and press them without shear. Collective."""
     mesh, tags = make_mesh(cells)
     V = fem.functionspace(mesh, ("Lagrange", degree, (2,)))
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
@@ -133,7 +134,7 @@ def press(cells: int, degree: int, stiffness: float) -> Pressed:
     pressure = fem.Constant(mesh, PETSc.ScalarType(0.0))
     shear = fem.Constant(mesh, PETSc.ScalarType(0.0))
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
-    # The linear part makes no force, and the moment about the origin that shear at y = R lacks.
+    # The linear part has no resultant; its moment about the origin balances that of shear at y = R.
     along = ufl.as_vector([1, 3 * ufl.SpatialCoordinate(mesh)[0] / R])
     F = body.residual(v) + (pressure * v[1] - shear * ufl.dot(along, v)) * ds(TOP)
     clamped = fem.locate_dofs_topological(V, 1, tags.find(BASE))
@@ -144,7 +145,7 @@ def press(cells: int, degree: int, stiffness: float) -> Pressed:
     )
     surface = fc.ContactSurface(mesh, tags, UPPER)
     contact = fc.Contact(u, surface, fc.DeformableBody(tags, LOWER), law)
-    # Pressed on without friction, on rollers along the axis; from then on friction holds it.
+    # Pressing is frictionless with rollers on the axis; then friction constrains the upper body.
     friction = contact.parameters["friction"]
     friction.value = 0.0
     axis = fem.locate_dofs_topological(V.sub(0), 1, tags.find(AXIS))
@@ -158,7 +159,7 @@ def press(cells: int, degree: int, stiffness: float) -> Pressed:
 
 
 def solve(arguments: argparse.Namespace) -> tuple[Pressed, dict[str, Any]]:
-    """Press, shear, and measure. Collective."""
+    """Press and shear, and compare with the theory. Collective."""
     start = time.perf_counter()
     scene = press(arguments.cells, arguments.degree, arguments.stiffness)
     contact = scene.contact
@@ -195,7 +196,7 @@ def solve(arguments: argparse.Namespace) -> tuple[Pressed, dict[str, Any]]:
 
 
 def draw(folder: Path, points: dict[str, np.ndarray]) -> None:
-    """Pressure and shear, then the shear alone, beside the theory. On this rank."""
+    """Plot pressure and shear, then the shear alone, with the theory. On this rank."""
     x = np.linspace(-A, A, 801)
     ellipse = np.sqrt(1 - (x / A) ** 2)
     title = f"Pressed, then sheared: Q/(μP) = {Q / (FRICTION * P):.3f}"
@@ -220,7 +221,7 @@ def draw(folder: Path, points: dict[str, np.ndarray]) -> None:
 
 
 def main() -> int:
-    """Run it; 0 if every reference is met."""
+    """Run the demo; return 0 if every reference is met."""
     parser = argparse.ArgumentParser(
         description=__doc__.splitlines()[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )

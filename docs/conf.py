@@ -1,8 +1,8 @@
-"""How the pages are made: ``python -m sphinx -W --keep-going -b html docs build/docs``.
+"""Configure the build of the pages: ``python -m sphinx -W --keep-going -b html docs build/docs``.
 
 The reference is read from the sources by sphinx-autoapi, which imports nothing. sphinx.ext.autodoc
-imports the package, and stand-ins for PETSc, UFL and DOLFINx do not bear what it does at import:
-releases are compared, reasons of SNES are made integers, constants are computed.
+imports the package, and stand-ins for PETSc, UFL and DOLFINx do not support what it does at import:
+releases are compared, SNES reasons are converted to integers, constants are computed.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ version = release = re.search(
 ).group(1)
 
 extensions = ["myst_parser", "autoapi.extension", "sphinx.ext.mathjax", "sphinx.ext.napoleon"]
-# The parts of benchmarks.md, which has all of them.
+# Parts that other pages include.
 exclude_patterns = ["benchmarks/*/*.md", "_generated"]
 
 myst_heading_anchors = 3
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 
-# Docstrings have code, and names of the package, in single backticks: a link where there is one.
+# Docstrings have code and names of the package in single backticks; known names become links.
 default_role = "py:obj"
 smartquotes = False
 napoleon_numpy_docstring = False
 napoleon_custom_sections = [("Attributes", "params_style")]
-# What stands before the colon of Returns is a description.
+# The text before the colon in Returns is a description, not a type.
 napoleon_use_rtype = False
 python_use_unqualified_type_names = True
 autodoc_member_order = "bysource"
@@ -45,13 +45,13 @@ autodoc_member_order = "bysource"
 autoapi_dirs = ["../fenics_contact"]
 autoapi_generate_api_docs = False
 autoapi_options = ["members", "inherited-members"]
-# Constants that are made several at once.
+# Constants that are assigned together in one statement.
 suppress_warnings = ["autoapi.python_import_resolution"]
 autoapi_member_order = "bysource"
 autoapi_python_class_content = "both"
 add_module_names = False
 
-# `-b linkcheck` asks all addresses; a host that is busy once is not gone.
+# `-b linkcheck` requests all addresses, and again if a host is busy.
 linkcheck_retries = 3
 linkcheck_timeout = 30
 
@@ -62,7 +62,7 @@ html_theme_options: dict[str, Any] = {"navigation_with_keys": False, "show_toc_l
 
 
 def escape(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Let |x| be an absolute value, where reStructuredText has a substitution."""
+    """Escape |x|, an absolute value that reStructuredText takes for a substitution."""
     for number, line in enumerate(lines):
         parts = re.split("(`+[^`]*`+)", line)
         parts[::2] = [part.replace("|", r"\|") for part in parts[::2]]
@@ -70,7 +70,7 @@ def escape(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[s
 
 
 def whole(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Put a property's sentence together again, of which napoleon makes a type before a colon."""
+    """Restore a property's sentence, of which napoleon takes the part before a colon for a type."""
     types = [line for line in lines if line.startswith(":type: ")]
     if what.endswith("property") and types:
         lines.remove(types[0])
@@ -78,7 +78,7 @@ def whole(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[st
 
 
 def fields() -> dict[str, str]:
-    """Signatures of the constructors that dataclasses have without writing them, by class."""
+    """Return the signatures of the generated constructors of dataclasses, by class."""
     package = HERE.parent / "fenics_contact"
     trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in package.rglob("*.py")}
     classes = {
@@ -87,7 +87,7 @@ def fields() -> dict[str, str]:
         for node in ast.walk(tree)
         if isinstance(node, ast.ClassDef)
     }
-    for line in trees[package / "__init__.py"].body:  # of several by a name the public one
+    for line in trees[package / "__init__.py"].body:  # of classes with the same name the public one
         if isinstance(line, ast.ImportFrom) and line.module != "fenics_contact":
             path = HERE.parent.joinpath(*str(line.module).split(".")).with_suffix(".py")
             for node in trees.get(path, ast.Module([], [])).body:
@@ -112,19 +112,19 @@ def fields() -> dict[str, str]:
 def sign(
     app: Any, what: str, name: str, obj: Any, options: Any, signature: str | None, returned: Any
 ) -> tuple[str, None] | None:
-    """Give dataclasses the signature of their constructor."""
+    """Return the signature of the constructor of a dataclass, if none is written."""
     made = FIELDS.get(name.rpartition(".")[2])
     written = what.endswith("class") and signature not in (None, "", "()")
     return (made, None) if what.endswith("class") and made and not written else None
 
 
 def skip(app: Any, what: str, name: str, obj: Any, skipped: bool, options: Any) -> bool | None:
-    """Leave out attributes that their class has described already."""
+    """Skip attributes without a docstring: that of their class describes them."""
     return True if what == "attribute" and not obj.docstring else None
 
 
 def setup(app: Any) -> None:
-    """Write what is generated before any page is read."""
+    """Write the generated tables, and connect the functions of this file to Sphinx's events."""
     messages.write(HERE / "_generated")
     app.connect("autodoc-process-docstring", escape, priority=400)  # before napoleon
     app.connect("autodoc-process-docstring", whole, priority=600)

@@ -1,9 +1,9 @@
-"""Every text with which the package refuses, fails or warns, read from its sources.
+"""Collect the texts of all errors, failures and warnings from the sources of the package.
 
-    python docs/messages.py             # the pages' tables, on the terminal
+    python docs/messages.py             # print the tables of the pages
 
-Sources are parsed, not imported. What a text has from the run is shown as …, words that stand in a
-constant or a variable of the function are filled in where they can be told.
+Sources are parsed, not imported. Values known only at run time are shown as …; strings in a
+constant or a variable of the function are filled in where they can be determined.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parent.parent / "fenics_contact"
 HOLE = "…"
-# More ways than this to fill a hole are left open.
+# A hole with more alternatives than this is not filled.
 _MOST = 4
-# Functions whose strings are parts of a verdict, and of what is told of an attempt.
+# Functions whose strings are parts of a verdict, and of the description of an attempt.
 _VERDICT = {"hidden_by_round_off", "limit_point", "round_off_in_words"}
 _ATTEMPT = {"describe_chattering", "describe"}
 
@@ -29,10 +29,10 @@ class Message:
     """A text of the package.
 
     Attributes:
-        module: Where it stands, with dots, without the package's name.
-        line: There.
-        kind: Class of the error, "warning", "log", "verdict" (what a state does not satisfy) or
-            "attempt" (what became of a method).
+        module: Dotted name of its module, without the name of the package.
+        line: Line in the module.
+        kind: Class of the error, "warning", "log", "verdict" (a violated condition) or
+            "attempt" (the outcome of a method).
         text: The text.
     """
 
@@ -43,12 +43,12 @@ class Message:
 
     @property
     def says(self) -> bool:
-        """Whether it has words of its own; else it passes on another's."""
+        """Whether the text has words; otherwise it only passes on another text."""
         return re.search("[a-z]{2}", self.text) is not None
 
 
 class _Module:
-    """A module, with what is needed to tell its texts."""
+    """A parsed module, from which messages are extracted."""
 
     def __init__(self, path: Path, package: Path) -> None:
         self.path = path
@@ -66,7 +66,7 @@ class _Module:
     # ---- texts -----------------------------------------------------------------------------------
 
     def texts(self, node: ast.AST, within: ast.AST | None, depth: int = 0) -> list[str]:
-        """All texts that an expression may have."""
+        """Return all texts that an expression may have."""
         if depth > 4:
             return [HOLE]
         if isinstance(node, ast.Constant):
@@ -95,19 +95,19 @@ class _Module:
         return [HOLE]
 
     def _joined(self, parts: list[list[str]]) -> list[str]:
-        known = [part or [HOLE] for part in parts]  # too many texts are as good as none
+        known = [part or [HOLE] for part in parts]  # too many texts count as none
         return self._some(["".join(each) for each in itertools.product(*known)]) or [
             "".join(part[0] if len(part) == 1 else HOLE for part in known)
         ]
 
     @staticmethod
     def _some(texts: list[str]) -> list[str]:
-        """They, if they are few."""
+        """Return the distinct texts, or none if there are more than `_MOST`."""
         texts = list(dict.fromkeys(texts))
         return texts if len(texts) <= _MOST else []
 
     def _named(self, name: str, within: ast.AST | None, depth: int) -> list[str]:
-        """What a variable of the function, or a constant of a module, stands for."""
+        """Return the texts of a variable of the function, or of a constant of a module."""
         for scope in (within, self.tree):
             body = ast.walk(scope) if scope is within and scope is not None else self.tree.body
             found = [
@@ -133,7 +133,7 @@ class _Module:
     # ---- messages --------------------------------------------------------------------------------
 
     def messages(self) -> Iterator[Message]:
-        """All that it has, in its order."""
+        """Yield all messages of the module in the order of `ast.walk`."""
         for node in ast.walk(self.tree):
             within = self.around.get(node)
             for kind, expression in self._said(node, within):
@@ -145,7 +145,7 @@ class _Module:
     def _said(
         self, node: ast.AST, within: ast.FunctionDef | None
     ) -> Iterator[tuple[str, ast.expr]]:
-        """Kinds of messages, and the expressions of their texts, that begin at a node."""
+        """Yield kind and text expression of the messages that begin at a node."""
         name = within.name if within is not None else ""
         told = dict.fromkeys(_VERDICT, "verdict")
         if self.name.startswith("methods."):
@@ -185,7 +185,7 @@ class _Module:
                 yield told[name], first
 
     def _of_error(self, call: ast.Call) -> str:
-        """The class that a call stands in, if it is an error; else empty."""
+        """Return the name of the error class that contains a call, or an empty string."""
         for node in ast.walk(self.tree):
             if isinstance(node, ast.ClassDef) and any(n is call for n in ast.walk(node)):
                 if any(ast.unparse(base).endswith("Error") for base in node.bases):
@@ -194,12 +194,12 @@ class _Module:
 
 
 _LOGGED = {"warning", "log"}
-# Kinds that have a table of their own; all others are errors.
+# Kinds with a separate table; all others are errors.
 KINDS = ("NotConverged", "verdict", "attempt", "warning", "log")
 
 
 def read(package: Path = PACKAGE) -> list[Message]:
-    """All messages that have words of their own, by module and line."""
+    """Return all messages that have words, sorted by module and line."""
     found = {
         message
         for path in sorted(package.rglob("*.py"))
@@ -213,7 +213,7 @@ def read(package: Path = PACKAGE) -> list[Message]:
 
 
 def _cell(text: str) -> str:
-    """A text as it stands, in a table of Markdown."""
+    """Escape a text for a table in Markdown."""
     return re.sub(r"([\\`*_\[\]<>|#$~{}])", r"\\\1", text)
 
 
@@ -223,7 +223,7 @@ def _table(rows: list[tuple[str, ...]]) -> str:
 
 
 def pages(found: list[Message]) -> dict[str, str]:
-    """The tables, by name of the file that a page includes; errors by folder of the package."""
+    """Return the tables by name of the included file, with errors by folder of the package."""
     made = {}
     for kind in KINDS:
         rows = list(dict.fromkeys((_cell(m.text),) for m in found if m.kind == kind))
@@ -242,7 +242,7 @@ def pages(found: list[Message]) -> dict[str, str]:
 
 
 def write(folder: Path) -> None:
-    """Write the tables where they are others than are there."""
+    """Write the tables whose files are missing or differ."""
     folder.mkdir(exist_ok=True)
     for name, text in pages(read()).items():
         path = folder / name

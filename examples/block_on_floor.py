@@ -1,4 +1,4 @@
-"""A block is pressed on a rigid floor, then pushed aside until it slides: the floor holds μ N."""
+"""A block is pressed on a rigid floor and pushed until it slides: the friction force is μ N."""
 
 import numpy as np
 import ufl
@@ -35,6 +35,6 @@ for load, end, steps in ((pressure, PRESSURE, 1), (push, 1e-4, 5)):  # push in m
 friction, expected = -forces.force[0], FRICTION * PRESSURE * LENGTH
 if msh.comm.rank == 0:
     print(f"T = {friction:.6g} N/mm, μ N = {expected:.6g} N/mm; points that stick: {forces.stick}")
-# Equilibrium makes N the load on the top, Coulomb's law T = μ N; solved to 1e-9 of the forces.
+# By equilibrium N is the load on the top, and T = μ N; the solver tolerance is 1e-9 of the forces.
 assert forces.stick == 0
 assert np.isclose(friction, expected, rtol=1e-7)

@@ -1,4 +1,4 @@
-"""An oval cam turns on rubber: the work of its torque is the energy that is stored."""
+"""An oval cam rotates on rubber: the work of its torque equals the stored energy."""
 
 import numpy as np
 import ufl
@@ -33,11 +33,11 @@ problem = fc.ContactProblem(rubber.residual(v), u, bcs=bcs, contacts=[contact])
 torque = [0.0]
 for _ in fc.increments(problem, angle, 0, np.pi / 2, steps=STEPS):
     torque.append(contact.moment(axle)[0])
-work = (sum(torque) - (torque[0] + torque[-1]) / 2) * np.pi / 2 / STEPS  # by trapezia
+work = (sum(torque) - (torque[0] + torque[-1]) / 2) * np.pi / 2 / STEPS  # trapezoidal rule
 energy = fem.assemble_scalar(fem.form(rubber.energy * ufl.dx))
 stored = msh.comm.allreduce(
     energy + contact.energy()
-)  # in the rubber, and in the penalty's springs
+)  # in the rubber, and in the springs of the penalty
 if msh.comm.rank == 0:
     print(f"work of the torque {work:.6g} mJ/mm, stored {stored:.6g} mJ/mm")
 assert np.isclose(work, stored, rtol=5e-3)

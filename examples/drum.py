@@ -1,4 +1,4 @@
-"""A rubber block under a rigid drum that turns all the way round: the torque of friction."""
+"""A rigid drum makes a full revolution on a rubber block: the torque of friction."""
 
 import numpy as np
 import ufl
@@ -32,8 +32,8 @@ problem = fc.ContactProblem(rubber.residual(v), u, bcs=bcs, contacts=[contact])
 list(fc.increments(problem, depth, 0, DEPTH, steps=5))
 list(fc.increments(problem, angle, 0, 2 * np.pi, steps=12))
 torque = contact.moment((0.0, axis[1] - DEPTH))[0]
-# It slides all over: the torque is that of μ p at the radius of the drum, which bears all pressure.
+# All points slip: the torque is that of the traction μ p at the radius of the drum.
 borne = msh.comm.allreduce(contact.measure @ contact.pressure)
 if msh.comm.rank == 0:
     print(f"torque {abs(torque):.6g} N mm/mm, μ R ∫p = {FRICTION * RADIUS * borne:.6g} N mm/mm")
-assert np.isclose(abs(torque), FRICTION * RADIUS * borne, rtol=5e-3)  # it penetrates by p/k_n
+assert np.isclose(abs(torque), FRICTION * RADIUS * borne, rtol=5e-3)  # the penetration is p/k_n

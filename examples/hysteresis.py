@@ -1,4 +1,4 @@
-"""A block is held on a floor that moves to and fro: the energy that friction takes in a cycle."""
+"""A fixed block is pressed on an oscillating floor: the energy dissipated in a cycle."""
 
 import numpy as np
 import ufl
@@ -8,7 +8,7 @@ from mpi4py import MPI
 import fenics_contact as fc
 
 FRICTION, PRESSURE, LENGTH, HEIGHT = 0.3, 10.0, 2.0, 1.0  # MPa, mm; forces in N per mm of depth
-K_T, AMPLITUDE = 1e3, 0.01  # springs that stretch before a point slips, MPa/mm; mm
+K_T, AMPLITUDE = 1e3, 0.01  # tangential penalty stiffness, MPa/mm; mm
 BOTTOM, TOP = 1, 2
 
 msh = mesh.create_rectangle(MPI.COMM_WORLD, [(0, 0), (LENGTH, HEIGHT)], (16, 8))
@@ -24,7 +24,7 @@ ds = ufl.Measure("ds", domain=msh, subdomain_data=tags)
 block = fc.elasticity.LinearElastic(u, E=2e5, nu=0.0, kind="plane strain")
 F = block.residual(v) + pressure * v[1] * ds(TOP)
 foot = fem.locate_dofs_topological(V.sub(0), 1, tags.find(BOTTOM))
-bcs = [fem.dirichletbc(0.0, foot, V.sub(0))]  # held sideways only; ν = 0: the pressure is uniform
+bcs = [fem.dirichletbc(0.0, foot, V.sub(0))]  # u_x = 0 only; uniform pressure, since ν = 0
 
 floor = fc.HalfSpace((0, 0), (0, 1), displacement=ufl.as_vector([way, 0]))
 surface = fc.ContactSurface(msh, tags, BOTTOM)
@@ -32,12 +32,12 @@ contact = fc.Contact(u, surface, floor, fc.Coulomb(FRICTION, k_t=K_T))
 problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
 list(fc.increments(problem, pressure, 0, PRESSURE))
 list(fc.increments(problem, way, 0, AMPLITUDE, steps=5))
-taken = 0.0  # in the cycle from here on
+taken = 0.0  # dissipation in the following cycle
 for start, end in ((AMPLITUDE, -AMPLITUDE), (-AMPLITUDE, AMPLITUDE)):
     taken += sum(s.energy.dissipation for s in fc.increments(problem, way, start, end, steps=10))
-# Springs of stiffness k that give way at ±μN: the loop of force over way is a parallelogram.
+# Springs of stiffness k that slip at ±μN: the loop of force over displacement is a parallelogram.
 limit, k = FRICTION * PRESSURE * LENGTH, K_T * LENGTH
 loop = 4 * limit * (AMPLITUDE - limit / k)
 if msh.comm.rank == 0:
     print(f"friction takes {taken:.6g} mJ/mm a cycle; area of the loop {loop:.6g} mJ/mm")
-assert np.isclose(taken, loop, rtol=1e-7)  # exact but for the solver's 1e-9 of the forces
+assert np.isclose(taken, loop, rtol=1e-7)  # exact; solver tolerance 1e-9 of the forces

@@ -1,4 +1,4 @@
-"""A law of one's own: between rough surfaces the pressure grows exponentially as they close up."""
+"""A user-defined law: the pressure between rough surfaces grows exponentially with penetration."""
 
 from dataclasses import dataclass
 
@@ -14,18 +14,18 @@ PRESSURE, BOTTOM, TOP, LEFT = 10.0, 1, 2, 3  # MPa; facets
 
 @dataclass(frozen=True)
 class Rough(fc.Law):
-    """Pressure p0 exp(δ/h), in MPa, where the gap has become -δ; p0 in MPa, h in mm."""
+    """Pressure p0 exp(δ/h) at the gap -δ; p0 in MPa, h in mm."""
 
     p0: float
     h: float
 
     def normal_potential(self, kinematics, parameters):
-        """Energy per area, whose derivative by δ is the pressure."""
+        """Return the energy per area, whose derivative with respect to δ is the pressure."""
         delta = -kinematics.gap
         return parameters["p0"] * parameters["h"] * ufl.exp(delta / parameters["h"])
 
     def contact_traction(self, kinematics, parameters):
-        """Normal traction; no friction."""
+        """Return the normal traction, without friction."""
         delta = -kinematics.gap
         pressure = parameters["p0"] * ufl.exp(delta / parameters["h"])
         return fc.ContactTraction(-pressure)
@@ -47,4 +47,4 @@ fc.ContactProblem(F, u, bcs=[fem.dirichletbc(0.0, left, V.sub(0))], contacts=[co
 found, expected = -contact.gather()["gap"], law.h * np.log(PRESSURE / law.p0)
 if msh.comm.rank == 0:
     print(f"closed up by {found.mean():.6g} mm; h ln(p/p0) = {expected:.6g} mm")
-assert np.allclose(found, expected, rtol=1e-7)  # at every point; forces are solved to 1e-9
+assert np.allclose(found, expected, rtol=1e-7)  # at every point; solver tolerance 1e-9

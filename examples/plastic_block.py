@@ -1,4 +1,4 @@
-"""A block pressed beyond its yield stress: plastic strains are a history of the script's own."""
+"""A block pressed beyond its yield stress, with plastic strains as user-defined state fields."""
 
 import sys
 
@@ -29,7 +29,7 @@ shear = (u[0].dx(1) + u[1].dx(0)) / 2
 strain = ufl.as_tensor([[u[0].dx(0), shear, 0], [shear, u[1].dx(1), 0], [0, 0, 0]])
 trial = 2 * G * ufl.dev(strain - plastic)
 size = ufl.sqrt(1.5 * ufl.inner(trial, trial) + (1e-9 * YIELD) ** 2)
-flow = ufl.max_value(1 - YIELD / size, 0) * trial / (2 * G)  # strains of the radial return
+flow = ufl.max_value(1 - YIELD / size, 0) * trial / (2 * G)  # strain increment of the radial return
 stress = trial - 2 * G * flow + K * ufl.tr(strain) * ufl.Identity(3)
 F = ufl.inner(stress, ufl.derivative(strain, u, v)) * ufl.dx(degree=2)
 grown = fem.Expression(plastic + flow, basix.make_quadrature(basix.CellType.triangle, 2)[0])

@@ -1,4 +1,4 @@
-"""A roller on rubber, pressed by a force and dragged, with no moment on it: it rolls."""
+"""A roller is pressed on rubber by a force and dragged without a moment on it: it rolls."""
 
 import numpy as np
 import ufl
@@ -24,7 +24,7 @@ bcs = [fem.dirichletbc(np.zeros(2), foot, V)]
 
 press, way, axis = fem.Constant(msh, 0.0), fem.Constant(msh, 0.0), (-WAY / 2, 1.0 + RADIUS)
 motion = fc.Motion(force=(None, press), displacement=(way, None))
-turn = fc.Rotation(None, about=axis, moment=0.0)  # the angle is found
+turn = fc.Rotation(None, about=axis, moment=0.0)  # the angle is unknown
 roller = fc.Cylinder(axis, RADIUS, displacement=motion, rotation=turn)
 surface = fc.ContactSurface(msh, tags, TOP)
 contact = fc.Contact(u, surface, roller, fc.Coulomb(0.5), kinematics="finite")
@@ -33,7 +33,7 @@ list(fc.increments(problem, press, 0, -FORCE))
 before = float(contact.free_angle.value)
 list(fc.increments(problem, way, 0, WAY, steps=8))
 turned = before - float(contact.free_angle.value)
-# It rolls by its way, but for the stretch of the rubber beneath it.
+# It rolls by its displacement, apart from the stretch of the rubber below it.
 if msh.comm.rank == 0:
     print(f"turned by {turned:.6g} rad, way / R = {WAY / RADIUS:.6g} rad")
 assert np.isclose(turned, WAY / RADIUS, rtol=1e-2)

@@ -1,4 +1,4 @@
-"""Three blocks meshed apart and joined in one mesh: contacts are found, and each bears the load."""
+"""Three separate meshes joined into one: contact pairs are found, and each transmits the load."""
 
 import numpy as np
 import ufl
@@ -8,11 +8,11 @@ from mpi4py import MPI
 import fenics_contact as fc
 
 PRESSURE, HEIGHT, FLOOR, ROOF, LEFT = 2.0, 0.5, 1, 2, 3  # MPa, mm; the blocks are 1 mm wide
-E = {"steel": 210e3, "plastic": 2e3, "brass": 100e3}  # MPa, from below upwards
+E = {"steel": 210e3, "plastic": 2e3, "brass": 100e3}  # MPa, from bottom to top
 
 
 def block(low, cells):
-    """A block over the height ``low``, its mesh and tags."""
+    """Return mesh, None for the cell tags, and facet tags of a block above the height ``low``."""
     msh = mesh.create_rectangle(MPI.COMM_WORLD, [(0, low), (1, low + HEIGHT)], (cells, cells))
     sides = {FLOOR: (1, low), ROOF: (1, low + HEIGHT), LEFT: (0, 0.0)}
     found = [

@@ -1,4 +1,4 @@
-"""Two blocks of different mesh and stiffness, one on the other, shorten as two springs would."""
+"""Two stacked blocks of different mesh and stiffness shorten like two springs in series."""
 
 import gmsh
 import numpy as np
@@ -9,11 +9,11 @@ from mpi4py import MPI
 import fenics_contact as fc
 
 E_LOWER, E_UPPER, HEIGHT, PRESSURE = 1000.0, 300.0, 1.0, 2.0  # MPa, mm; the blocks are 1 mm wide
-BOTTOM, TOP, LEFT, BELOW, ABOVE = 1, 2, 3, 4, 5  # the blocks meet with BELOW and ABOVE
+BOTTOM, TOP, LEFT, BELOW, ABOVE = 1, 2, 3, 4, 5  # BELOW and ABOVE are the contact surfaces
 gmsh.initialize()
 gmsh.option.setNumber("General.Terminal", 0)
 if MPI.COMM_WORLD.rank == 0:
-    for block in (0, 1):  # of lines 1 to 4 and 5 to 8: bottom, right, top, left
+    for block in (0, 1):  # lines 1 to 4 and 5 to 8: bottom, right, top, left
         gmsh.model.occ.addRectangle(0, block * HEIGHT, 0, 1, HEIGHT)
     gmsh.model.occ.synchronize()
     for line in range(1, 9):  # 5 cells along the lines of the lower block, 8 of the upper one
@@ -40,5 +40,5 @@ shortening = mesh.comm.allreduce(fem.assemble_scalar(fem.form(-u[1] * ds(TOP))))
 expected = PRESSURE * HEIGHT * (1 / E_LOWER + 1 / E_UPPER)
 if mesh.comm.rank == 0:
     print(f"the blocks shorten by {shortening:.6g} mm, two springs by {expected:.6g} mm")
-# Linear elements have the exact solution; the multipliers leave 1e-5 of a penalty's penetration.
+# Linear elements are exact; the multipliers reduce the penalty's penetration to 1e-5 of it.
 assert np.isclose(shortening, expected, rtol=1e-5)

@@ -1,5 +1,5 @@
-"""Bodies, meshes, tags and elasticity that tests, benchmarks and verification share.
+"""Bodies, meshes, tags and elasticity common to tests, benchmarks and verification.
 
-Whoever makes a scene twice finds the one place for it here. Nothing here is part of the package
-`fenics_contact`, nor of what its demos need: those are scripts that users run as they stand.
+Problems that are needed more than once are defined here. Neither the package `fenics_contact` nor
+its demos, which are self-contained scripts, depend on this package.
 """

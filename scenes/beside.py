@@ -1,6 +1,6 @@
-"""Scenes of boxes, and unrelated bodies that are busy in the same mesh meanwhile.
+"""Scenes of boxes, and unrelated loaded bodies in the same mesh.
 
-Whatever such a body does, is and bears, the outcome of the scene beside it is the same.
+The outcome of a scene must not depend on motion, stiffness and loads of the unrelated bodies.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from fenics_contact.types import Array
 from scenes.blocks import BOTTOM, RIGHT, TOP, block_mesh
 from scenes.bodies import Bodies
 
-# How far from the origin busy bodies stand.
+# Distance of the unrelated bodies from the origin.
 PLACE = 30.0
 
 
 @dataclass(frozen=True)
 class Box:
-    """A box of quadrilaterals, and of what.
+    """A box of quadrilaterals, and its Young's modulus.
 
     Attributes:
-        low, size: Its lowest corner and its sides (length).
-        n: Cells along both.
-        E: Young's modulus, by that of the scene.
-        bend: Moves its nodes, (n, 2).
+        low, size: Its lowest corner and the lengths of its edges (length).
+        n: Cells along both edges.
+        E: Young's modulus relative to that of the scene.
+        bend: Map of the nodes, (n, 2).
     """
 
     low: tuple[float, float] = (0.0, 0.0)
@@ -41,7 +41,7 @@ class Box:
     bend: Callable[[Array], Array] | None = None
 
     def mesh(self) -> tuple[dolfinx.mesh.Mesh, None, dolfinx.mesh.MeshTags]:
-        """Its mesh, no tags of cells, and tags of its sides. Collective."""
+        """Return the mesh, None for the cell tags, and the tags of the sides. Collective."""
         mesh, tags = block_mesh("quadrilateral", n=self.n, size=self.size)
         x = mesh.geometry.x[:, :2]
         x[:] = (self.bend(x) if self.bend else x) + self.low
@@ -50,15 +50,15 @@ class Box:
 
 @dataclass(frozen=True)
 class Busy:
-    """An unrelated block, its top moved, or loaded and its bottom on a floor of its own.
+    """An unrelated block, by default on a floor, whose top is displaced or loaded.
 
     Attributes:
-        E: Young's modulus, by that of the scene.
-        place: Where it stands along x (length).
-        moved: By how much its top is moved aside and up (length); None: it is loaded instead.
-        load: Traction on its top aside and up, by E.
-        floor: Whether it stands on a floor; else its bottom is free.
-        wall: How far away a wall is that it may come to (length); None: there is none.
+        E: Young's modulus relative to that of the scene.
+        place: Its position along x (length).
+        moved: Displacement of its top along x and y (length); None: it is loaded instead.
+        load: Traction on its top along x and y, relative to E.
+        floor: Whether it stands on a floor; otherwise its bottom is free.
+        wall: Distance to a wall that it may touch (length); None: no wall.
     """
 
     E: float = 1.0
@@ -83,14 +83,14 @@ BUSY = {
 
 @dataclass
 class Beside:
-    """Boxes in one mesh with busy bodies: elastic, plane strain, ν = 0.3.
+    """Boxes and unrelated bodies in one mesh: elastic, plane strain, ν = 0.3.
 
     Attributes:
-        boxes: Of the scene, by name.
+        boxes: Boxes of the scene, by name.
         busy: The unrelated bodies.
-        rubber: Whether all are of rubber.
-        E: Young's modulus that those of all bodies are given by (stress).
-        bodies: Mesh, tags, displacement, residual and conditions.
+        rubber: Whether all bodies are neo-Hookean.
+        E: Young's modulus to which those of all bodies are relative (stress).
+        bodies: Mesh, tags, displacement, residual and Dirichlet conditions.
     """
 
     boxes: Mapping[str, Box]
@@ -100,7 +100,7 @@ class Beside:
     bodies: Bodies = field(init=False)
 
     def __post_init__(self) -> None:
-        """Make mesh and residual. Collective."""
+        """Create mesh and residual. Collective."""
         more = {f"busy {i}": Box((b.place, 0.0), n=(2, 2), E=b.E) for i, b in enumerate(self.busy)}
         self._all = {**self.boxes, **more}
         self._joined = fc.join_meshes({name: box.mesh() for name, box in self._all.items()})
@@ -109,12 +109,12 @@ class Beside:
         if self.rubber:
             elastic = NeoHookean(self.bodies.u, modulus, 0.3, "plane strain")
             self.bodies.F = elastic.residual(self.bodies.v)
-        self._share = self.bodies.constant(0.0)  # of what busy bodies do
+        self._share = self.bodies.constant(0.0)  # load factor of the unrelated bodies
         self._led: list[tuple[fem.Constant, Array]] = []
         self._contacts: list[fc.Contact] = []
 
     def tag(self, box: str, side: int) -> int:
-        """Of a side of a box, in the mesh of all."""
+        """Return the tag of a side of a box in the common mesh."""
         return self._joined.facet(box, side)
 
     def hold(self, box: str, side: int, *components: int, value: Any = 0.0) -> None:
@@ -126,17 +126,17 @@ class Beside:
         self.bodies.F -= value * self.bodies.v[component] * self.bodies.ds(self.tag(box, side))
 
     def contact(self, box: str, side: int, obstacle: Any, law: Any, **options: Any) -> fc.Contact:
-        """Contact of a side with an obstacle, or with a side of another box. Collective."""
+        """Return the contact of a side with an obstacle or a side of another box. Collective."""
         if isinstance(obstacle, tuple):
             obstacle = fc.DeformableBody(self.bodies.tags, self.tag(*obstacle))
         return self.bodies.contact(self.tag(box, side), obstacle, law, **options)
 
     def problem(self, *contacts: fc.Contact, **options: Any) -> fc.ContactProblem:
-        """The problem, with the contacts of the busy bodies. Collective."""
+        """Return the problem, including contacts of the unrelated bodies. Collective."""
         return self.bodies.problem(*contacts, *self._keep_busy(contacts), **options)
 
     def _keep_busy(self, contacts: Sequence[fc.Contact]) -> list[fc.Contact]:
-        """Conditions and loads of the busy bodies, and their contacts. Collective."""
+        """Apply conditions and loads of the unrelated bodies; return their contacts. Collective."""
         made = []
         finite = {"kinematics": "finite"} if any(c.finite for c in contacts) else {}
         for i, busy in enumerate(self.busy):
@@ -158,7 +158,7 @@ class Beside:
         return made
 
     def keep_busy(self, share: float) -> None:
-        """Let the busy bodies have done a share of what they do."""
+        """Set the load factor, from 0 to 1, of the unrelated bodies."""
         self._share.value = share
         for constant, whole in self._led:
             constant.value = share * whole

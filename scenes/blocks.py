@@ -1,4 +1,4 @@
-"""Boxes of every kind of cell, their sides tagged, and an elastic block in contact."""
+"""Boxes of every cell type with tagged sides, and an elastic block in contact."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ BOTTOM, TOP, LEFT, RIGHT, FRONT, BACK = 1, 2, 3, 4, 5, 6
 
 
 def dimension(cell: str) -> int:
-    """2 or 3."""
+    """Return the dimension of a cell type, 2 or 3."""
     return 2 if cell in ("triangle", "quadrilateral") else 3
 
 
@@ -44,11 +44,11 @@ def block_mesh(
     partitioner: Callable | None = None,
     ghost_mode: GhostMode = GhostMode.none,
 ) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """A box [0, size_i] with its sides tagged; the last coordinate is the height.
+    """Return a box [0, size_i] and the tags of its sides; the last coordinate is the height.
 
-    ``shuffled``: vertices are renumbered at random, cells turned and mirrored at random, vertices
-    moved inside the sides, so that facets of all orientations occur and no cell is like another.
-    ``bend``: cells of geometric degree 2, their nodes (n, d) moved by this map.
+    ``shuffled``: vertices are renumbered, cells are rotated and reflected, and vertices are moved
+    within their sides, all at random, so that facets of all orientations occur and cells differ.
+    ``bend``: cells have geometric degree 2, and this map moves their nodes (n, d).
     """
     d = dimension(cell)
     n = (n,) * d if np.ndim(n) == 0 else tuple(n)
@@ -71,15 +71,15 @@ def block_mesh(
     degree = 1 if bend is None else 2
     mesh = mesh_of(cell, x * size, cells, degree=degree, comm=comm, partitioner=partitioner)
     tags = side_tags(mesh, size)
-    if bend is not None:  # when the sides are found
+    if bend is not None:  # after the sides have been located
         mesh.geometry.x[:, :d] = bend(mesh.geometry.x[:, :d])
     return mesh, tags
 
 
 def layers(cell: str) -> Callable:
-    """A partitioner that gives every rank its share of the cells in their order.
+    """Return a partitioner that gives every rank a contiguous range of the cells.
 
-    Of boxes one cell wide these are layers, from the bottom.
+    In boxes one cell wide these ranges are layers, numbered from the bottom.
     """
     n_vertices = 4 if cell == "quadrilateral" else 8
 
@@ -93,7 +93,7 @@ def layers(cell: str) -> Callable:
 def _shuffle(x: Array, cells: Array, cell: str) -> tuple[Array, Array]:
     rng = np.random.default_rng(5)
     d = x.shape[1]
-    # Along a side only: the bubble of a coordinate vanishes where the coordinate is 0 or 1.
+    # The bubble of a coordinate vanishes at 0 and 1, so that vertices stay on their sides.
     bubble = x * (1 - x)
     x = x + 0.3 * bubble * rng.uniform(-1, 1, size=x.shape)
     number = rng.permutation(len(x))
@@ -112,7 +112,7 @@ def _shuffle(x: Array, cells: Array, cell: str) -> tuple[Array, Array]:
 
 
 def side_tags(mesh: dolfinx.mesh.Mesh, size: Sequence[float]) -> dolfinx.mesh.MeshTags:
-    """Tags BOTTOM, TOP, LEFT, RIGHT and, in 3D, FRONT, BACK."""
+    """Return facet tags BOTTOM, TOP, LEFT, RIGHT and, in 3D, FRONT and BACK."""
     d = mesh.geometry.dim
     ends = {BOTTOM: (d - 1, 0.0), TOP: (d - 1, size[d - 1]), LEFT: (0, 0.0), RIGHT: (0, size[0])}
     if d == 3:
@@ -127,7 +127,7 @@ def side_tags(mesh: dolfinx.mesh.Mesh, size: Sequence[float]) -> dolfinx.mesh.Me
 
 
 def polynomial(d: int, degree: int, seed: int, size: float) -> Callable[[Array], Array]:
-    """A vector field of points (d, n) -> (d, n) with random coefficients up to ``size``."""
+    """Return a polynomial field (d, n) -> (d, n) with random coefficients up to ``size``."""
     rng = np.random.default_rng(seed)
     linear = rng.uniform(-size, size, (d, d))
     quadratic = rng.uniform(-size, size, (d, d, d)) * (degree > 1)
@@ -140,7 +140,7 @@ def polynomial(d: int, degree: int, seed: int, size: float) -> Callable[[Array],
 
 
 def wave(d: int, seed: int) -> Callable[[Array], Array]:
-    """A rough field for directions of derivatives, the same on any number of ranks."""
+    """Return a rough field, a direction for derivatives, the same on any number of ranks."""
     rng = np.random.default_rng(seed)
     phases, waves = rng.uniform(0, 6, (d, 1)), rng.uniform(3, 9, (d, d))
     return lambda x: np.sin(waves @ x[:d] + phases)
@@ -151,7 +151,7 @@ def wave(d: int, seed: int) -> Callable[[Array], Array]:
 
 @dataclass
 class Block:
-    """An elastic box, its bottom Γc; every number in its forms is a constant.
+    """An elastic box whose bottom is Γc; all parameters of its forms are constants.
 
     Attributes:
         traction: Force per area on the top.
@@ -170,7 +170,7 @@ class Block:
     F: ufl.Form = field(init=False)
 
     def __post_init__(self) -> None:
-        """Make the residual."""
+        """Create the residual."""
         v = ufl.TestFunction(self.u.function_space)
         ds = ufl.ds(self.mesh, subdomain_data=self.tags)
         dx = ufl.dx(self.mesh)
@@ -179,11 +179,11 @@ class Block:
 
     @property
     def dim(self) -> int:
-        """2 or 3."""
+        """The geometric dimension, 2 or 3."""
         return self.mesh.geometry.dim
 
     def vector(self, *, side: float = 0.0, up: float = 0.0) -> Array:
-        """Components along x and along the height, zeros else."""
+        """Return the vector with components ``side`` along x and ``up`` along the height."""
         value = np.zeros(self.dim)
         value[0], value[-1] = side, up
         return value
@@ -193,14 +193,14 @@ class Block:
         self.traction.value[:] = self.vector(side=side, up=up)
 
     def pull(self, tag: int, traction: Array) -> fem.Constant:
-        """Add a traction on another side to the residual, and return it."""
+        """Add a traction on the side ``tag`` to the residual, and return its constant."""
         given = fem.Constant(self.mesh, traction)
         v = ufl.TestFunction(self.u.function_space)
         self.F -= ufl.dot(given, v) * ufl.ds(self.mesh, subdomain_data=self.tags)(tag)
         return given
 
     def facet_dofs(self, tag: int, component: int | None = None) -> Array:
-        """Dofs of a side, of all components or of one."""
+        """Return the dofs of a side, of all components or of one."""
         space = self.u.function_space
         if component is not None:
             space = space.sub(component)
@@ -208,25 +208,25 @@ class Block:
         return fem.locate_dofs_topological(space, fdim, self.tags.find(tag))
 
     def hold(self, tag: int, component: int, value: Any = 0.0) -> fem.DirichletBC:
-        """Prescribe one component on a side."""
+        """Return the Dirichlet condition for one component of u on a side."""
         return hold(self.u, self.tags, tag, component, value)
 
     def rollers(self) -> list[fem.DirichletBC]:
-        """No displacement across the planes x = 0 and, in 3D, y = 0."""
+        """Return zero normal displacement on the planes x = 0 and, in 3D, y = 0."""
         bcs = [self.hold(LEFT, 0)]
         return bcs + ([self.hold(FRONT, 1)] if self.dim == 3 else [])
 
     def floor(self, *, displacement: Any = None) -> fc.HalfSpace:
-        """A floor that just touches the bottom."""
+        """Return a half-space whose plane touches the bottom."""
         return fc.HalfSpace((0.0,) * self.dim, self.vector(up=1.0), displacement=displacement)
 
     def contact(self, law: Any, *, displacement: Any = None, **kwargs: Any) -> fc.Contact:
-        """Contact of the bottom, by default with the floor."""
+        """Return the contact of the bottom, by default with the floor."""
         obstacle = kwargs.pop("obstacle", None) or self.floor(displacement=displacement)
         return fc.Contact(self.u, self.surface, obstacle, law, **kwargs)
 
     def wall(self, law: Any) -> fc.Contact:
-        """Contact of the left side with a wall that it just touches."""
+        """Return the contact of the left side with a half-space whose plane touches it."""
         surface = fc.ContactSurface(self.mesh, self.tags, LEFT)
         obstacle = fc.HalfSpace((0.0,) * self.dim, self.vector(side=1.0))
         return fc.Contact(self.u, surface, obstacle, law, name="wall")
@@ -239,7 +239,7 @@ class Block:
         contact: dict | None = None,
         **kwargs: Any,
     ) -> tuple[fc.ContactProblem, fc.Contact]:
-        """The problem and its one contact; ``contact``: arguments of `Block.contact`."""
+        """Return the problem and its contact; ``contact`` has arguments of `Block.contact`."""
         made = self.contact(law, **(contact or {}))
         return fc.ContactProblem(self.F, self.u, bcs=bcs, contacts=[made], **kwargs), made
 
@@ -255,7 +255,7 @@ def block(
     surface: dict | None = None,
     **mesh_arguments: Any,
 ) -> Block:
-    """A `Block` with the traction (side, up) on its top."""
+    """Return a `Block` with the traction (side, up) on its top."""
     mesh, tags = block_mesh(cell, **mesh_arguments)
     zero = np.zeros(mesh.geometry.dim)
     made = Block(
@@ -273,13 +273,13 @@ def block(
 
 
 def bulge(scene: Block, depth: float = 0.01) -> fc.Obstacle:
-    """A floor that is lower to the sides, by the depth times the distance squared."""
+    """Return a parabolic floor with the gap ``depth`` (x - 0.4)² below the bottom."""
     x = ufl.SpatialCoordinate(scene.mesh)
     return fc.PrescribedGap(depth * (x[0] - 0.4) ** 2, scene.vector(up=-1.0))
 
 
 def kirchhoff(scene: Block) -> ufl.Form:
-    """Another bulk form of a block, St Venant-Kirchhoff's with ν = 0: S = E · Green strain."""
+    """Return the residual for St Venant-Kirchhoff's law with ν = 0: S = E times Green's strain."""
     v = ufl.TestFunction(scene.u.function_space)
     F = ufl.Identity(scene.dim) + ufl.grad(scene.u)
     S = scene.E * (F.T * F - ufl.Identity(scene.dim)) / 2

@@ -1,4 +1,4 @@
-"""Meshes of boxes, straight or bent, several in one mesh, and the elasticity in them."""
+"""Several straight or bent boxes in one mesh, and their linear elasticity."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COMM = MPI.COMM_WORLD
 
 
 def graded(fine: float, cells: int, end: float, growth: float = 1.25) -> Array:
-    """Coordinates from 0: ``cells`` equal cells up to ``fine``, then growing ones up to ``end``."""
+    """Return coordinates of ``cells`` equal cells up to ``fine`` and growing ones up to ``end``."""
     h = fine / cells
     more = [h * growth]
     while fine + sum(more) < end:
@@ -39,15 +39,15 @@ def boxes(
     degree: int = 1,
     partitioner: Any = None,
 ) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """Boxes that share no node, each cut along its coordinates. Collective.
+    """Return a mesh of tensor-product boxes without common nodes, and its tags. Collective.
 
     Args:
-        axes: Of every box, its coordinates along each direction, ascending.
-        sides: Tags of facets and which ones have them, before ``bend``.
+        axes: For every box, the ascending coordinates of its nodes in each direction.
+        sides: Tags of facets and the functions that select them, evaluated before ``bend``.
         simplex: Triangles (in the plane) instead of quadrilaterals and hexahedra.
-        bend: Moves the nodes, (n, d).
-        degree: Of the cells' geometry.
-        partitioner: DOLFINx's, of the cells, all of which the first rank has.
+        bend: Map of the nodes, (n, d).
+        degree: Geometric degree of the cells.
+        partitioner: Partitioner for DOLFINx; the cells are all on the first rank.
     """
     d = len(axes[0])
     corners, cells, first = [], [], 0
@@ -57,7 +57,7 @@ def boxes(
         corners.append(np.column_stack([g.ravel() for g in grid]))
         number = first + np.arange(np.prod(counts)).reshape(counts)
         found = []
-        for corner in range(2**d):  # the first coordinate runs fastest
+        for corner in range(2**d):  # the first coordinate varies fastest
             cut = tuple(
                 slice(corner >> i & 1, n - 1 + (corner >> i & 1)) for i, n in enumerate(counts)
             )
@@ -84,12 +84,12 @@ class Bodies:
     """Linear elastic bodies in one mesh, plane strain or three dimensions.
 
     Attributes:
-        mesh, tags: As given.
+        mesh, tags: The mesh and its facet tags.
         u: Displacement.
         v: Test function.
         stress: σ(u) (UFL).
-        F: Residual without loads, to be added to.
-        bcs: Conditions made by `hold`.
+        F: Residual; loads are subtracted from it by the caller.
+        bcs: Dirichlet conditions added by `hold`.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Bodies:
         *,
         degree: int = 1,
     ) -> None:
-        """Make displacement and residual. Collective."""
+        """Create displacement and residual. Collective."""
         self.mesh, self.tags = made
         self.d = self.mesh.geometry.dim
         space = displacement_space(self.mesh, degree)
@@ -113,21 +113,21 @@ class Bodies:
 
     @property
     def dofs(self) -> int:
-        """Number of unknown displacements on all ranks."""
+        """The number of displacement dofs on all ranks."""
         dofmap = self.u.function_space.dofmap
         return int(dofmap.index_map.size_global * dofmap.index_map_bs)
 
     @property
     def x(self) -> Any:
-        """Coordinates (UFL)."""
+        """The coordinates (UFL)."""
         return ufl.SpatialCoordinate(self.mesh)
 
     def constant(self, value: Any = 0.0) -> fem.Constant:
-        """A number, or vector, to be changed later."""
+        """Return a constant scalar or vector whose value can be changed."""
         return fem.Constant(self.mesh, np.asarray(value, dtype=np.float64))
 
     def ds(self, tag: int) -> Any:
-        """Measure of a side."""
+        """Return the measure of a side."""
         return ufl.ds(self.mesh, subdomain_data=self.tags)(tag)
 
     def hold(self, tag: int, *components: int, value: Any = 0.0) -> None:
@@ -139,24 +139,27 @@ class Bodies:
     def contact(
         self, tag: Any, obstacle: Any, law: Any, *, quadrature: int | None = None, **options: Any
     ) -> fc.Contact:
-        """Contact of a side with an obstacle, or with the sides of a tag or tags. Collective."""
+        """Return the contact of a side with an obstacle, or with tagged sides. Collective."""
         if not isinstance(obstacle, fc.Obstacle):
             obstacle = fc.DeformableBody(self.tags, obstacle)
         surface = fc.ContactSurface(self.mesh, self.tags, tag, quadrature_degree=quadrature)
         return fc.Contact(self.u, surface, obstacle, law, **options)
 
     def problem(self, *contacts: fc.Contact, **options: Any) -> fc.ContactProblem:
-        """The problem with these contacts. Collective."""
+        """Return the problem with these contacts. Collective."""
         return fc.ContactProblem(self.F, self.u, bcs=self.bcs, contacts=list(contacts), **options)
 
     def cells(self, where: Callable[[Array], Array]) -> Array:
-        """Cells of this rank, ghosts included, whose midpoints (n, d) are chosen."""
+        """Return the cells of this rank, with ghosts, whose midpoints (n, d) ``where`` selects."""
         index_map = self.mesh.topology.index_map(self.d)
         cells = np.arange(index_map.size_local + index_map.num_ghosts, dtype=np.int32)
         middle = dolfinx.mesh.compute_midpoints(self.mesh, self.d, cells).reshape(-1, 3)
         return cells[where(middle[:, : self.d])]
 
     def displace(self, field: Callable[[Array], Array], where: Callable[[Array], Array]) -> None:
-        """Give chosen cells, which share no node with the others, a displacement. Collective."""
+        """Set the displacement of the selected cells and update ghosts. Collective.
+
+        The selected cells must have no node in common with the others.
+        """
         self.u.interpolate(field, cells0=self.cells(where))
         self.u.x.scatter_forward()

@@ -1,10 +1,10 @@
-"""Two plates under a bolt that friction alone holds: tightened, then pulled until all slips.
+"""A bolted joint of two plates that transmits the load by friction until all contacts slip.
 
 Plates of 40 x 20 x 4 mm overlap by 30 mm, each with a bore of 6.6 mm; the bolt has a shank of 6 mm
 and, as head and nut, discs of 11 x 3 mm. It is tightened by an interference under its head. The
-lower plate is held at one end, the upper one guided at the other and pulled along. The shank meets
-no bore: what holds it in place is friction under head and nut, and what is pulled beyond the
-friction of all three joints finds no equilibrium.
+lower plate is fixed at one end; the upper one is guided at the other end and pulled along x. The
+shank does not touch the bores: friction under head and nut constrains the bolt, and there is no
+equilibrium above the friction limit of the three contacts.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from scenes.histories import History
 LENGTH, WIDTH, THICKNESS, OVERLAP = 40.0, 20.0, 4.0, 30.0  # mm
 BORE, SHANK, HEAD, HEIGHT = 3.3, 3.0, 5.5, 3.0  # radii, and the height of head and nut
 E, NU, FRICTION, INTERFERENCE = 210e3, 0.3, 0.2, 0.02  # MPa, mm
-# Sides: ends of the plates, both sides of the three joints.
+# Tags: fixed and pulled end of the plates, both sides of the three contacts.
 HELD, PULLED, UNDER, OVER, SEAT, RING, NUT_SEAT, NUT_RING = range(1, 9)
 _LOWER, _UPPER, _BOLT = 1, 2, 3
 _JOINTS = {"plates": (UNDER, OVER), "head": (RING, SEAT), "nut": (NUT_RING, NUT_SEAT)}
 
 
 def joint_mesh(size: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """Tetrahedra of a size (mm), at the bolt of half of it, and tags of the sides. Collective."""
+    """Return tetrahedra of a size (mm), half of it at the bolt, and facet tags. Collective."""
     gmsh.initialize()
     try:
         gmsh.option.setNumber("General.Terminal", 0)
@@ -79,15 +79,15 @@ def joint_mesh(size: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
 
 
 class BoltedJoint(History):
-    """The joint: tightened until t = 1, then pulled by 1000 N a unit of t.
+    """The joint: tightened until t = 1, then pulled by 1000 N per unit of t.
 
     Attributes:
         u: Displacement.
-        tags: Of the sides.
-        contacts: Of plates, head and nut.
+        tags: Facet tags.
+        contacts: Contacts of plates, head and nut.
         tight: Interference under the head (length).
-        pull: On the end of the upper plate (force).
-        problem: With all of them.
+        pull: Load on the end of the upper plate (force).
+        problem: Problem with the three contacts.
     """
 
     def __init__(
@@ -98,13 +98,13 @@ class BoltedJoint(History):
         contact: dict | None = None,
         **options: Any,
     ) -> None:
-        """Make it, not tightened.
+        """Create the problem, not tightened. Collective.
 
         Args:
-            size: See `joint_mesh`.
-            degree: Of the displacement.
+            size: Cell size, see `joint_mesh` (mm).
+            degree: Polynomial degree of the displacement.
             contact: Arguments of every contact.
-            options: Those of the problem.
+            options: Arguments of the problem.
         """
         mesh, tags = joint_mesh(size)
         self.tags = tags
@@ -127,6 +127,6 @@ class BoltedJoint(History):
         self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=self.contacts, **options)
 
     def load(self, t: float) -> None:
-        """Tighten, then pull."""
+        """Set the interference and the load at t."""
         self.tight.value = INTERFERENCE * min(t, 1.0)
         self.pull.value = 1000.0 * max(t - 1.0, 0.0)

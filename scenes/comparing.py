@@ -1,6 +1,7 @@
-"""What is found on all ranks, and comparisons that fail on all of them together.
+"""Assembly on all ranks, and collective comparisons.
 
-Every assertion looks at gathered data: a rank that failed alone would leave the others waiting.
+Assertions compare gathered data and fail on all ranks: a failure on one rank alone would leave the
+others waiting.
 """
 
 from __future__ import annotations
@@ -25,17 +26,17 @@ from fenics_contact.types import Array
 
 
 def compiled(form: ufl.Form, contact: fc.Contact | None = None) -> fem.Form:
-    """The form as DOLFINx has it, with the entity maps that a contact's own forms take."""
+    """Return the compiled form, with the entity maps of the forms of the contact."""
     return compile_form(form, contact.entity_maps if contact else None)
 
 
 def assemble_number(form: fem.Form, comm: MPI.Comm) -> float:
-    """The number that a form without arguments is, on all ranks."""
+    """Return the integral of a form without arguments, summed over all ranks."""
     return comm.allreduce(fem.assemble_scalar(form))
 
 
 def assemble_owned(form: fem.Form, space: fem.FunctionSpace) -> Array:
-    """Assembled linear form at this rank's owned dofs."""
+    """Return the assembled linear form at this rank's owned dofs."""
     f = fem.Function(space)
     fem.assemble_vector(f.x.array, form)
     f.x.scatter_reverse(dolfinx.la.InsertMode.add)
@@ -43,7 +44,7 @@ def assemble_owned(form: fem.Form, space: fem.FunctionSpace) -> Array:
 
 
 def assemble_matrix(form: fem.Form) -> PETSc.Mat:
-    """A bilinear form without conditions."""
+    """Return the matrix of a bilinear form without Dirichlet conditions."""
     matrix = fem.petsc.create_matrix(form)
     fem.petsc.assemble_matrix(matrix, form)
     matrix.assemble()
@@ -51,19 +52,19 @@ def assemble_matrix(form: fem.Form) -> PETSc.Mat:
 
 
 def owned(f: fem.Function) -> Array:
-    """Values at this rank's owned dofs."""
+    """Return a view of the values at this rank's owned dofs."""
     dofmap = f.function_space.dofmap
     return f.x.array[: dofmap.index_map.size_local * dofmap.index_map_bs]
 
 
 def set_owned(f: fem.Function, values: Array) -> None:
-    """Set these values, and the ghosts with them."""
+    """Set the values at the owned dofs, and update the ghosts."""
     owned(f)[:] = values
     f.x.scatter_forward()
 
 
 def shared_folder(tmp_path: Path) -> Path:
-    """Rank 0's folder, on all ranks."""
+    """Return the folder of rank 0 on all ranks."""
     return Path(MPI.COMM_WORLD.bcast(str(tmp_path)))
 
 
@@ -71,14 +72,14 @@ def shared_folder(tmp_path: Path) -> Path:
 
 
 def gathered(comm: MPI.Comm, rows: Array) -> Array:
-    """The rows of all ranks on all ranks."""
+    """Return the rows of all ranks, on all ranks."""
     return np.concatenate(comm.allgather(np.asarray(rows)), axis=0)
 
 
 def sorted_by_place(places: Array, *columns: Array) -> Array:
-    """Rows (place, columns) in the order of the places, to 1e-9 of their extent.
+    """Return rows (coordinates, columns) sorted by coordinates rounded to 1e-9 of the largest.
 
-    For comparisons between meshes: two equal ones may be distributed differently.
+    Results on equal meshes with different distributions become comparable.
     """
     size = float(np.abs(places).max(initial=0.0)) or 1.0
     order = np.lexsort(np.round(places / size, 9).T)
@@ -86,7 +87,7 @@ def sorted_by_place(places: Array, *columns: Array) -> Array:
 
 
 def nodal(u: fem.Function) -> Array:
-    """Values (all nodes, bs) at the owned nodes of all ranks, in the order of their places."""
+    """Return values (all nodes, bs) of all ranks, sorted by the coordinates of the nodes."""
     space = u.function_space
     d, bs = space.mesh.geometry.dim, space.dofmap.index_map_bs
     n = space.dofmap.index_map.size_local
@@ -96,14 +97,14 @@ def nodal(u: fem.Function) -> Array:
 
 
 def at_points(contact: fc.Contact, rows: Array) -> Array:
-    """Rows (points, …) of all ranks, in the order of the points' places."""
+    """Return rows (points, …) of all ranks, sorted by the coordinates of the points."""
     comm = contact.surface.mesh.comm
     d = contact.points.shape[1]
     return sorted_by_place(gathered(comm, contact.points), gathered(comm, rows))[:, d:]
 
 
 def close(actual: Any, expected: Any, rtol: float, *, scale: float | None = None) -> bool:
-    """Largest difference within ``rtol`` of the largest expected entry (or ``scale``)."""
+    """Return whether differences are within ``rtol`` of the largest expected entry or ``scale``."""
     actual, expected = np.asarray(actual, dtype=float), np.asarray(expected, dtype=float)
     assert actual.shape == expected.shape
     if not actual.size:
@@ -117,13 +118,13 @@ def close(actual: Any, expected: Any, rtol: float, *, scale: float | None = None
 
 
 def identical(a: Iterable[Array], b: Iterable[Array]) -> bool:
-    """Bit for bit, on all ranks."""
+    """Return whether the arrays are equal bit for bit on all ranks."""
     same = all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
     return bool(np.all(MPI.COMM_WORLD.allgather(same)))
 
 
 def on_first(check: Callable[[], None]) -> None:
-    """Run it on the first rank, fail on all of them. Collective."""
+    """Run a check on the first rank; if it fails, fail on all ranks. Collective."""
     error, comm = None, MPI.COMM_WORLD
     if comm.rank == 0:
         try:
@@ -139,7 +140,7 @@ def raised_everywhere(
     *words: str,
     comm: MPI.Comm = MPI.COMM_WORLD,
 ) -> str:
-    """Assert that every rank raises ``kind`` and that the text names all of ``words``."""
+    """Assert that all ranks raise ``kind`` with the same text, which has all ``words``."""
     error: Exception | None = None
     try:
         call()
@@ -158,7 +159,7 @@ def raised_everywhere(
 def same_field(
     f: fem.Function, expected: Callable[[Array], Array], rtol: float, *, scale: float | None = None
 ) -> bool:
-    """Whether ``f`` is the interpolant of ``expected``, all ranks together."""
+    """Return whether ``f`` is the interpolant of ``expected``, compared on all ranks."""
     reference = fem.Function(f.function_space)
     reference.interpolate(expected)
     comm = f.function_space.mesh.comm
@@ -166,10 +167,10 @@ def same_field(
 
 
 def same_effort(iterations: Sequence[int], others: Sequence[int]) -> bool:
-    """Whether as many increments took as many iterations each, but for one.
+    """Return whether the iterations of every increment differ by at most one.
 
-    By round-off the last iteration is just enough, or just not; what else makes more or fewer of
-    them, as units in a setting of the solver, makes many.
+    Round-off decides whether a last iteration is needed. Other causes, such as a setting of the
+    solver that depends on units, change the number of iterations by more than one.
     """
     return len(iterations) == len(others) and all(
         abs(a - b) <= 1 for a, b in zip(iterations, others, strict=True)

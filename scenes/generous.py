@@ -1,4 +1,4 @@
-"""Blocks all of whose top is tagged, more than can touch what is pressed on it and dragged."""
+"""Blocks whose whole top is Γc, under a tool that touches only a part of it and is dragged."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from scenes.tags import near, tagged
 
 BASE, TOP, ROUND, LID, SIDE = 1, 2, 3, 4, 5
 E, NU, RADIUS, DEEP = 1000.0, 0.3, 4.0, 0.01
-# Cells of the block, of edges 2 (and 2) and 0.4: its top has more than a thousand unknowns.
+# Cells of the block, with edges 2 (and 2) and 0.4: its top has more than a thousand dofs.
 CELLS = {"quadrilateral": (520, 4), "triangle": (520, 4), "tetrahedron": (19, 19, 2)}
 HEIGHT = 0.4
 
 
 class Pressed(History):
-    """A ball, or disc, goes down into the middle until t = 1, then along by 0.25 a unit of t.
+    """A ball or disc that is pressed into the middle until t = 1, then dragged with velocity 0.25.
 
     Attributes:
         u: Displacement.
-        contact, problem: As made.
+        contact, problem: The contact and its problem.
     """
 
     def __init__(
@@ -49,19 +49,20 @@ class Pressed(History):
         comm: MPI.Comm = MPI.COMM_WORLD,
         **options: Any,
     ) -> None:
-        """Make it, unloaded. Collective.
+        """Create the unloaded problem. Collective.
 
         Args:
-            law: Of the contact, by default Coulomb's.
-            cell: Kind of the cells.
-            within: How far from its middle the top is tagged.
-            deep: How far the ball goes.
-            force: What drives it down; 0: it goes as far as that.
-            pressure: On the base, which is not held then: the ball alone holds the block up.
+            law: Contact law, by default Coulomb's.
+            cell: Cell type.
+            within: Half-width of Γc.
+            deep: Displacement of the ball.
+            force: Force on the ball; 0: its displacement is prescribed.
+            pressure: Pressure on the base; if it is not 0, the base is free, and only the ball
+                supports the block vertically.
             length: Unit of lengths.
             contact: Arguments of `fc.Contact`.
-            comm: The ranks.
-            **options: Of the problem.
+            comm: MPI communicator of the mesh.
+            **options: Arguments of the problem.
         """
         d, up = dimension(cell), dimension(cell) - 1
         low, high = np.array([-1.0] * up + [-HEIGHT]), np.array([1.0] * up + [0.0])
@@ -98,7 +99,7 @@ class Pressed(History):
         self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=[self.contact], **options)
 
     def load(self, t: float) -> None:
-        """Set what moves the ball, or the block."""
+        """Set the displacement of the ball or the force on it, or the pressure on the base."""
         self.push.value = self._pressure * min(t, 1.0)
         if self._pressure:
             return
@@ -108,11 +109,11 @@ class Pressed(History):
 
 
 class Shod(History):
-    """The same in the plane with a round shoe, a body of its own, its lid moved: along by 0.04.
+    """A plane block under a rounded shoe, pressed until t = 1, then dragged with velocity 0.04.
 
     Attributes:
-        u: Displacement of both.
-        contact, problem: As made.
+        u: Displacement of both bodies.
+        contact, problem: The contact and its problem.
     """
 
     def __init__(
@@ -125,7 +126,7 @@ class Shod(History):
         contact: dict | None = None,
         **options: Any,
     ) -> None:
-        """Make it, unloaded; ``within`` and ``deep`` as of `Pressed`. Collective."""
+        """Create the unloaded problem; ``within`` and ``deep`` are as in `Pressed`. Collective."""
         self._deep = deep
         cell, x, cells, offset = "quadrilateral", [], [], 0
         for low, high, n in (
@@ -136,7 +137,7 @@ class Shod(History):
             x.append(part.geometry.x[:, :2].copy())
             cells.append(compat.geometry_dofmap(part) + offset)
             offset += len(x[-1])
-        # Its sole is a parabola, of the ball's radius at the middle.
+        # The lower side of the shoe is a parabola with the radius of the ball in the middle.
         x[1][:, 1] += (1 - x[1][:, 1] / 0.3) * x[1][:, 0] ** 2 / (2 * RADIUS)
         mesh = mesh_of(cell, np.concatenate(x), np.concatenate(cells))
 
@@ -161,6 +162,6 @@ class Shod(History):
         self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=[self.contact], **options)
 
     def load(self, t: float) -> None:
-        """Set what moves the lid."""
+        """Set the displacement of the top of the shoe."""
         self.down.value = -self._deep * min(t, 1.0)
         self.along.value = 0.04 * max(t - 1.0, 0.0)

@@ -1,4 +1,4 @@
-"""Histories to be broken off and taken up from a file, and what their states have to have alike."""
+"""Load histories for restarts from checkpoints, and comparisons of their states."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ COMM = MPI.COMM_WORLD
 
 
 class History:
-    """Something pressed and rubbed: down until t = 1, along until 2, back until 4."""
+    """A load history: press until t = 1, slide until 2, slide back until 4."""
 
-    tolerance = 1e-7  # between two solutions of the same increments
+    tolerance = 1e-7  # relative difference of two solutions of the same increments
     problem: fc.ContactProblem
 
     def load(self, t: float) -> None:
-        """Set the loads."""
+        """Set the loads at the time t."""
         raise NotImplementedError
 
     def increments(self, end: float = 4.0, start: float = 0.0, **options: Any) -> Iterable[fc.Step]:
-        """Lead ``t``, 0.5 an increment by default."""
+        """Return the increments from ``start`` to ``end``, by default with t increased by 0.5."""
         options.setdefault("steps", round(abs(end - start) / 0.5))
         return fc.increments(self.problem, self.load, start, end, **options)
 
 
 class Press(History):
-    """A block on a ball, by default with friction: the top moves, or the ball does."""
+    """A block on a ball, by default with friction; its top or the ball has a prescribed motion."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class Press(History):
         held: Sequence[int] | None = None,
         **options: Any,
     ) -> None:
-        """Make it, unloaded; ``held`` are the components of the top that are, by default all."""
+        """Create the unloaded problem; ``held``: prescribed components of the top (default all)."""
         scene = self.scene = block(cell, degree, n=n, E=E, surface=surface)
         mesh, d = scene.mesh, scene.dim
         law = law or fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
@@ -102,7 +102,7 @@ class Press(History):
         self.problem = fc.ContactProblem(F, scene.u, bcs=bcs, contacts=contacts, **options)
 
     def load(self, t: float) -> None:
-        """Set what moves."""
+        """Set the displacement of the top or of the ball, or the force on the ball."""
         down, along = 0.03 * min(t, 1.0), np.interp(t, [1, 2, 4], [0, 0.1, -0.1])
         if self.moves == "fixed":
             self.push[-1].value, self.push[0].value = -down, along
@@ -113,7 +113,7 @@ class Press(History):
 
 
 class Ramp(Slider, History):
-    """A block that is dragged up a ramp of another body, its pairs found anew; top held stiffly."""
+    """A block dragged up the ramp of another body, with updated pairs and a prescribed top."""
 
     def __init__(
         self,
@@ -124,12 +124,12 @@ class Ramp(Slider, History):
         start: float = 1.1,
         **options: Any,
     ) -> None:
-        """Make it, unloaded."""
+        """Create the unloaded problem."""
         law = law or fc.Coulomb(0.3, k_n=1e7, k_t=1e7)
         super().__init__(cell, law, start=start, slope=0.1, n=n, **options)
 
     def load(self, t: float) -> None:
-        """Down, and over one and a half facets of the base and back."""
+        """Press, drag over one and a half facets of the base, and drag back by half a facet."""
         self.move[-1].value = -0.004 * min(t, 1.0)
         self.move[0].value = np.interp(t, [1, 3, 4], [0, 0.6, 0.4])
 
@@ -138,7 +138,7 @@ class Ramp(Slider, History):
 
 
 def picture(made: History) -> dict[str, Array]:
-    """All that a state is, in an order that no distribution changes."""
+    """Return all data of a state, in an order independent of the distribution to ranks."""
     problem = made.problem
     found = {"u": _nodal(problem, problem.u), "increment": np.array([problem.increment])}
     field = fem.Function(problem.u.function_space)
@@ -167,7 +167,7 @@ def picture(made: History) -> dict[str, Array]:
 
 
 def _nodal(problem: fc.ContactProblem, field: fem.Function) -> Array:
-    """Values of what is solved for, or a field like it, in an order of places."""
+    """Return nodal values of a field in the space of u, ordered by position."""
     if not problem.displacement.is_mixed:
         return nodal(field)
     parts = range(field.function_space.num_sub_spaces)
@@ -175,18 +175,22 @@ def _nodal(problem: fc.ContactProblem, field: fem.Function) -> Array:
 
 
 def differences(a: History, b: History, tolerance: float) -> list[str]:
-    """What of two states differs; tolerance 0: bit for bit, or else of what is solved for."""
+    """Return the names of the data that differ between two states.
+
+    With tolerance 0 all data are compared bit for bit, otherwise displacements, contact histories,
+    jumps and resultant forces.
+    """
     one, other = picture(a), picture(b)
     assert one.keys() == other.keys()
     if tolerance == 0.0:
         return [n for n in one if not np.array_equal(one[n], other[n], equal_nan=True)]
-    # Tractions, forces and energies, by the largest of their kind; statuses may hang on a digit.
+    # Differences are relative to the largest value; round-off may change the status of a point.
     compared = [n for n in one if n.split()[-1] in ("u", "state", "history", "jump", "forces")]
     return [n for n in compared if not close(one[n], other[n], tolerance)]
 
 
 def same_energies(a: fc.Step, b: fc.Step, tolerance: float) -> bool:
-    """Of two steps; to round-off where the digits are the same."""
+    """Return whether the energies of two steps agree, at best to a round-off of 1e-12."""
     size = abs(b.energy.work) + abs(b.energy.elastic)
     names = ("work", "elastic", "springs", "dissipation", "remainder")
     pairs = [(getattr(a.energy, n), getattr(b.energy, n)) for n in names]
@@ -202,7 +206,7 @@ def goes_on(
     tamper: Callable[[History], None] | None = None,
     **options: Any,
 ) -> None:
-    """A history broken off after ``stop`` increments and taken up is one that went on."""
+    """Assert that a history restarted after ``stop`` increments equals an uninterrupted one."""
     whole, broken, after, again = (make() for _ in range(4))
     tolerance = whole.tolerance if tolerance is None else tolerance
     tolerance = 0.0 if COMM.size == 1 else tolerance
@@ -230,7 +234,7 @@ def goes_on(
             found = step.contacts[name].force
             assert close(found, r.force, tolerance, scale=scale), step.increment
     assert differences(after, whole, tolerance) == []
-    # What is finished is taken up as it ended, results and status included.
+    # A finished history is restored at its end, including results and status.
     assert not list(again.increments(checkpoint=path, **options))
     assert differences(again, after, 0.0 if COMM.size == 1 else 1e-12) == []
     slips = ([c.resultants().slip for c in m.problem.contacts] for m in (again, after))

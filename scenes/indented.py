@@ -1,4 +1,4 @@
-"""A rigid cylinder pressed into half of a block, for meshes that are adapted."""
+"""A rigid cylinder pressed into a block with a symmetry axis, for mesh adaptation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RADIUS, DEPTH, STIFFNESS = 4.0, 0.01, 1e5
 
 
 def half_block(n: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """[0, 1] x [-1, 0] in triangles, its base, top and axis tagged. Collective."""
+    """Return the half [0, 1] x [-1, 0] of a block in triangles, and its tags. Collective."""
     mesh = dolfinx.mesh.create_rectangle(
         MPI.COMM_WORLD, [(0, -1), (1, 0)], (n, n), ghost_mode=GhostMode.none
     )
@@ -30,7 +30,7 @@ def half_block(n: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
 def press(
     mesh: dolfinx.mesh.Mesh, tags: dolfinx.mesh.MeshTags, friction: float = 0.0, steps: int = 1
 ) -> tuple[fc.ContactProblem, Any, Any]:
-    """The problem, solved in so many increments, its stress and its strain. Collective."""
+    """Solve in ``steps`` increments; return problem, stress and strain (UFL). Collective."""
     space = displacement_space(mesh, 2)
     u, v = fem.Function(space), ufl.TestFunction(space)
     body = LinearElastic(u, 1000.0, 0.3, "plane strain")

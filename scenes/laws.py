@@ -1,4 +1,4 @@
-"""Laws of a user's own: exponential overclosure, friction on it or with a bound, an adhesive."""
+"""User-defined laws: exponential overclosure, friction on it or with a bound, an adhesive."""
 
 from __future__ import annotations
 
@@ -14,62 +14,62 @@ from fenics_contact.laws.return_maps import positive_part
 
 @dataclass(frozen=True)
 class Overclosure(fc.Law):
-    """Pressure p0 exp(δ/h) at the overclosure δ = u_n - s: asperities that touch at a distance."""
+    """Pressure p0 exp(δ/h) of asperities at the overclosure δ = -g_N, also at positive gaps."""
 
     p0: Any
     h: Any
 
     @property
     def positive(self):
-        """Both."""
+        """The names of the positive parameters, p0 and h."""
         return frozenset({"p0", "h"})
 
     def pressure(self, closing, parameters):
-        """p0 exp(δ/h)."""
+        """Return the pressure p0 exp(δ/h)."""
         return parameters["p0"] * ufl.exp(closing / parameters["h"])
 
     def contact_traction(self, kinematics, parameters):
-        """The pressure, nothing along Γc."""
+        """Return the pressure without a tangential traction."""
         closing = -kinematics.gap
         pressure = self.pressure(closing, parameters)
         return fc.ContactTraction(-pressure)
 
     def normal_potential(self, kinematics, parameters):
-        """∫ p dδ."""
+        """Return the potential ∫ p dδ."""
         closing = -kinematics.gap
         return parameters["h"] * self.pressure(closing, parameters)
 
 
 @dataclass(frozen=True)
 class Bond(fc.Law):
-    """An adhesive that pulls by k_n o exp(-o/h) at the opening o, and pushes by the same."""
+    """An adhesive with the normal traction k_n o exp(-o/h) at the opening or penetration o."""
 
     k_n: Any
     h: Any
 
     @property
     def has_tension(self):
-        """It pulls."""
+        """Whether the law has tension: yes."""
         return True
 
     @property
     def positive(self):
-        """Both."""
+        """The names of the positive parameters, k_n and h."""
         return frozenset({"k_n", "h"})
 
     @property
     def strength(self):
-        """The largest pull, at o = h."""
+        """The largest tension, at o = h."""
         return self.k_n * self.h * math.exp(-1)
 
     def contact_traction(self, kinematics, parameters):
-        """The pull, nothing along Γc."""
+        """Return the tension without a tangential traction."""
         opening = kinematics.gap
         pull = parameters["k_n"] * opening * ufl.exp(-opening / parameters["h"])
         return fc.ContactTraction(pull)
 
     def normal_potential(self, kinematics, parameters):
-        """∫ pull do."""
+        """Return the potential, the integral of the tension over the opening."""
         k_n, h = parameters["k_n"], parameters["h"]
         opening = kinematics.gap
         return -k_n * h * (h + opening) * ufl.exp(-opening / h)
@@ -77,7 +77,7 @@ class Bond(fc.Law):
 
 @dataclass(frozen=True)
 class Asperities(fc.FrictionLaw):
-    """Coulomb's friction on a pressure p0 (exp(δ/h) - 1) of the penetration δ alone."""
+    """Coulomb friction with the pressure p0 (exp(δ/h) - 1) at the penetration δ ≥ 0."""
 
     friction: Any
     p0: Any
@@ -86,11 +86,11 @@ class Asperities(fc.FrictionLaw):
 
     @property
     def positive(self):
-        """All but friction."""
+        """The names of the positive parameters: all but the friction coefficient."""
         return frozenset({"p0", "h", "k_t"})
 
     def contact_traction(self, kinematics, parameters):
-        """The pressure, and friction up to μ times it."""
+        """Return the pressure, and friction up to μ times the pressure."""
         penetration = positive_part(-kinematics.gap)
         pressure = parameters["p0"] * (ufl.exp(penetration / parameters["h"]) - 1)
         bound = self.friction_bound(kinematics, pressure, parameters)
@@ -98,7 +98,7 @@ class Asperities(fc.FrictionLaw):
         return fc.ContactTraction(-pressure, traction, bound, slip)
 
     def normal_potential(self, kinematics, parameters):
-        """∫ p dδ."""
+        """Return the potential ∫ p dδ."""
         p0, h = parameters["p0"], parameters["h"]
         penetration = positive_part(-kinematics.gap)
         return p0 * h * (ufl.exp(penetration / h) - 1) - p0 * penetration
@@ -106,7 +106,7 @@ class Asperities(fc.FrictionLaw):
 
 @dataclass(frozen=True)
 class Saturating(fc.FrictionLaw):
-    """Friction that a weak layer bounds: τ ≤ s (1 - exp(-μ p/s)), nearly Coulomb's for p ≪ s/μ."""
+    """Friction with the saturating bound s (1 - exp(-μ p/s)), nearly Coulomb's for p ≪ s/μ."""
 
     friction: Any
     strength: Any
@@ -114,12 +114,12 @@ class Saturating(fc.FrictionLaw):
     k_t: Any
 
     def friction_bound(self, kinematics, pressure, parameters):
-        """The bound."""
+        """Return the bound s (1 - exp(-μ p/s)) of the tangential traction."""
         s = parameters["strength"]
         return s * (1 - ufl.exp(-parameters["friction"] * pressure / s))
 
     def contact_traction(self, kinematics, parameters):
-        """Unilateral contact, and friction up to the bound."""
+        """Return the traction of unilateral contact with friction up to the bound."""
         pressure = parameters["k_n"] * positive_part(-kinematics.gap)
         bound = self.friction_bound(kinematics, pressure, parameters)
         traction, slip = self.return_map(kinematics, bound, parameters)

@@ -1,4 +1,4 @@
-"""Meshes of given nodes and cells."""
+"""Meshes created from given nodes and cells."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ def mesh_of(
     comm: MPI.Comm = MPI.COMM_WORLD,
     partitioner: Any = None,
 ) -> dolfinx.mesh.Mesh:
-    """Distribute nodes (n, d) and cells, all of which the first rank has. Collective.
+    """Create a distributed mesh from nodes (n, d) and cells of the first rank. Collective.
 
     Args:
-        cell: Kind of the cells.
-        x: Places of the nodes.
-        cells: Numbers of the nodes of each, in DOLFINx's order.
-        degree: Of the geometry.
-        comm: The ranks.
-        partitioner: DOLFINx's.
+        cell: Cell type.
+        x: Coordinates of the nodes.
+        cells: Node numbers of every cell, in DOLFINx's order.
+        degree: Geometric degree.
+        comm: MPI communicator.
+        partitioner: Partitioner for DOLFINx.
     """
     if comm.rank:
         x, cells = x[:0], cells[:0]
@@ -41,7 +41,7 @@ def mesh_of(
 
 
 def one_rank_each(owner: Index) -> Any:
-    """What a partitioner returns that gives every cell to one rank, (n_cells,)."""
+    """Return a partitioner's result that assigns every cell to its rank ``owner``, (n_cells,)."""
     owner = owner.astype(np.int32)
     lists = dolfinx.graph.adjacencylist(owner, np.arange(len(owner) + 1, dtype=np.int32))
     return getattr(lists, "_cpp_object", lists)

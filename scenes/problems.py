@@ -1,8 +1,8 @@
-"""Bodies, what they touch and how they are loaded: the demos' and two that only benchmarks have.
+"""Contact problems of the demos and of the benchmarks, described apart from their solution.
 
-A `Body` says it all apart from how it is solved: `parts` makes its displacement, residual and
-conditions, `contact` and `problem` what this package needs of it, `penalty` the boundary form that
-a user of DOLFINx would write by hand.
+A `Body` has mesh, obstacle and loads. `parts` makes its displacement, residual and conditions,
+`problem` the contact problem of this package, and `penalty` the boundary form of a reference
+solution with DOLFINx alone.
 """
 
 from __future__ import annotations
@@ -33,27 +33,28 @@ Parts = tuple[fem.Function, ufl.Form, fem.Constant, list[fem.DirichletBC]]
 
 @dataclass(frozen=True)
 class Body:
-    """A mesh, what it may touch and what is done to it.
+    """An elastic body with its mesh, obstacle, boundary conditions and loads.
 
     Attributes:
         mesh, tags: The mesh and the tags of its facets.
-        E, nu, kind: Of `LinearElastic`.
-        friction: μ.
+        E, nu, kind: Arguments of `LinearElastic`.
+        friction: Friction coefficient μ.
         surface: Tag of Γc.
-        held: Components (component, tag) that do not move.
-        end: Of the load parameter.
+        held: Pairs (component, tag) of displacement components that are fixed at zero.
+        end: Final value of the load parameter.
         work: Virtual work of the loads (test function, load parameter, ds).
-        contact: Makes the obstacle, and the gap if it is given apart from the geometry, of the load
-            parameter: arguments of `fc.Contact`.
-        displacement: The one to compare.
-        glued: Facets held in a linear solve, the unit of time.
-        pressed: Virtual work of its loads (test function, ds), if not ``work`` at the end.
-        force: That of the contact, about, by which residuals are measured (force).
-        h: Height of the cells at Γc: k = stiffness E/h of forms by hand (length).
-        by_hand: For them, of the place x and the load parameter: normal from the body to the
-            obstacle, gap, and the obstacle's motion (UFL).
-        push: Start of Newton's method by hand, a displacement, where it needs contact to start.
-        history: Whether the result depends on the increments of the load.
+        contact: Function of the load parameter that returns the obstacle, and the gap if it is not
+            given by the geometry, as arguments of `fc.Contact`.
+        displacement: Function of u that returns the displacement to compare.
+        glued: Facets fixed in a linear solve, whose duration is the unit of time.
+        pressed: Virtual work of the loads of that solve (test function, ds), by default ``work``
+            at the end.
+        force: Approximate contact force, the scale of residuals (force).
+        h: Height of the cells at Γc; the reference form has k = stiffness E/h (length).
+        by_hand: Function of the position x and the load parameter that returns, for the reference
+            form, the normal from the body to the obstacle, the gap and the obstacle's motion (UFL).
+        push: Initial displacement of the reference Newton method, if it must start in contact.
+        history: Whether the result depends on the load increments.
     """
 
     mesh: dolfinx.mesh.Mesh
@@ -78,19 +79,19 @@ class Body:
 
     @property
     def ds(self) -> ufl.Measure:
-        """Measure of the boundary, by tag."""
+        """The boundary measure with the facet tags."""
         return ufl.Measure("ds", domain=self.mesh, subdomain_data=self.tags)
 
     def elastic(self, u: fem.Function) -> LinearElastic:
-        """Its elasticity, for a displacement."""
+        """Return the elastic law of the body for the displacement u."""
         return LinearElastic(u, self.E, self.nu, self.kind)
 
 
-# ---- what is made of a body ----------------------------------------------------------------------
+# ---- problem and reference form ------------------------------------------------------------------
 
 
 def parts(body: Body, degree: int) -> Parts:
-    """Displacement, residual without contact, load parameter (0), Dirichlet conditions."""
+    """Return displacement, residual without contact, load parameter (0) and Dirichlet values."""
     space = displacement_space(body.mesh, degree)
     u, v = fem.Function(space), ufl.TestFunction(space)
     load = fem.Constant(body.mesh, PETSc.ScalarType(0.0))
@@ -100,7 +101,7 @@ def parts(body: Body, degree: int) -> Parts:
 
 
 def law(body: Body, stiffness: float) -> fc.Coulomb | fc.Frictionless:
-    """Coulomb's or none, k_n = k_t = ``stiffness`` E/h."""
+    """Return the law, Coulomb's or frictionless, with k_n = k_t = ``stiffness`` E/h."""
     k = fc.RelativeStiffness(stiffness)
     return fc.Coulomb(body.friction, k_n=k, k_t=k) if body.friction else fc.Frictionless(k_n=k)
 
@@ -115,16 +116,16 @@ def problem(
     rule: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> tuple[fc.ContactProblem, fc.Contact, fem.Function, fem.Constant]:
-    """The contact problem of this package, its contact, displacement and load parameter (0).
+    """Return this package's contact problem, its contact, displacement and load parameter (0).
 
     Args:
         body: The body.
-        degree: Of the displacement.
+        degree: Polynomial degree of the displacement.
         stiffness: k_n and k_t in units of E/h, or the law.
-        made: What `parts` made of it, if it is there.
+        made: Result of `parts`, if it has been called already.
         choices: More arguments of `fc.Contact`.
-        rule: Of `fc.ContactSurface`.
-        **options: Of `fc.ContactProblem`.
+        rule: Arguments of `fc.ContactSurface`, such as its quadrature.
+        **options: Arguments of `fc.ContactProblem`.
     """
     u, residual, load, bcs = made or parts(body, degree)
     surface = fc.ContactSurface(body.mesh, body.tags, body.surface, **(rule or {}))
@@ -135,11 +136,11 @@ def problem(
 
 
 def penalty(body: Body, u: fem.Function, load: Any, stiffness: float) -> tuple[Any, Any]:
-    """Pressure and traction on Γc of a penalty form by hand, in one increment (UFL).
+    """Return pressure and traction on Γc of the reference penalty form for one increment (UFL).
 
     Args:
         body: The body.
-        u: Its displacement.
+        u: Displacement of the body.
         load: The load parameter.
         stiffness: k_n and k_t in units of E/h.
     """
@@ -157,12 +158,12 @@ def penalty(body: Body, u: fem.Function, load: Any, stiffness: float) -> tuple[A
 
 
 def count(space: fem.FunctionSpace) -> int:
-    """Number of unknowns."""
+    """Return the number of dofs on all ranks."""
     return int(space.dofmap.index_map.size_global * space.dofmap.bs)
 
 
 def count_on(space: fem.FunctionSpace, facets: np.ndarray) -> int:
-    """Number of unknowns on facets. Collective."""
+    """Return the number of dofs on the given facets of all ranks. Collective."""
     found = fem.locate_dofs_topological(space, space.mesh.topology.dim - 1, facets)
     owned = np.count_nonzero(found < space.dofmap.index_map.size_local)
     return int(space.mesh.comm.allreduce(owned) * space.dofmap.bs)
@@ -173,10 +174,11 @@ def count_on(space: fem.FunctionSpace, facets: np.ndarray) -> int:
 
 @cache
 def half_cylinder(friction: float, h: float, *, smooth: bool = False, **growth: float) -> Body:
-    """The demo's half-cylinder on a plane; ``smooth``: cells away from Γc shrink with those on it.
+    """Return the demo's half-cylinder on a plane.
 
-    Smooth meshes have an error below 1e-6 in the displacement of the top at h = 0.02. By ``growth``
-    cells away from Γc are as the demo's mesh is told.
+    With ``smooth``, cells away from Γc are refined together with those on it; the error of the
+    displacement of the top is then below 1e-6 at h = 0.02. Otherwise ``growth`` are the arguments
+    of the demo's mesh for the cells away from Γc.
     """
     if smooth:
         growth = {"grading": min(0.3, 2.5 * h), "coarsest": min(hertz.R / 4, 12.5 * h)}
@@ -198,7 +200,7 @@ def half_cylinder(friction: float, h: float, *, smooth: bool = False, **growth: 
         force=hertz.R * hertz.PAPER_LOAD,
         h=h,
         by_hand=_plane,
-        # Nothing else holds it.
+        # Only contact constrains the vertical rigid-body mode.
         push=(0.0, -0.05),
         history=friction > 0,
     )
@@ -206,7 +208,7 @@ def half_cylinder(friction: float, h: float, *, smooth: bool = False, **growth: 
 
 @cache
 def greco_block(cells: int) -> Body:
-    """The demo's GRECO block; the displacement is u_x of the left bottom corner (µm)."""
+    """Return the demo's GRECO block; its displacement is u_x of the left bottom corner (µm)."""
     mesh, tags = greco.make_mesh(cells)
     return Body(
         mesh=mesh,
@@ -236,13 +238,13 @@ def greco_block(cells: int) -> Body:
 
 
 def _plane(x: Any, load: Any) -> tuple[Any, Any, Any]:
-    """The plane y = 0, at rest."""
+    """Return normal, gap and motion of the fixed plane y = 0."""
     return ufl.as_vector([0, -1]), x[1], ufl.as_vector([0, 0])
 
 
 @cache
 def rings(h: float) -> Body:
-    """The demo's shrink fit, plane strain; the displacement is that of the bore."""
+    """Return the demo's shrink fit in plane strain; its displacement is u_x of the bore."""
     s = shrink_fit
     mesh, tags = s.make_mesh(h)
     return Body(
@@ -267,9 +269,9 @@ def rings(h: float) -> Body:
 
 @cache
 def ball_on_half_space(cells: int) -> Body:
-    """The demo's ball on a block of tetrahedra, ``cells`` a contact radius, without friction.
+    """Return the demo's frictionless ball on a block of tetrahedra, ``cells`` per contact radius.
 
-    The displacement is that below the ball's centre.
+    The displacement is u_z below the centre of the ball.
     """
     depth = 4e-4
     mesh, tags = sphere.make_mesh("block", np.sqrt(sphere.R * depth), cells)
@@ -290,17 +292,18 @@ def ball_on_half_space(cells: int) -> Body:
     )
 
 
-RADIUS, DEPTH = 8.0, 1.25e-3  # of the ball; a = √(R d) = 0.1, the block's edge is 1
-WIDTH = 0.15  # of Γc
+# Radius and indentation depth of the ball: a = √(R d) = 0.1; the block has edges of length 1.
+RADIUS, DEPTH = 8.0, 1.25e-3
+WIDTH = 0.15  # width of Γc
 AT_X, AT_Y, AT_Z, FAR_X, FAR_Y, TOUCHING = range(1, 7)
 
 
 @cache
 def ball_on_block(cells: int, friction: float = 0.3) -> Body:
-    """A rigid ball pressed on a quarter of a block of hexahedra, ``cells`` along each edge.
+    """Return a rigid ball pressed on a quarter of a block of hexahedra, ``cells`` along each edge.
 
-    Half of the cells of an edge lie on Γc, 1.5 contact radii wide, and are cubes. The far sides
-    are held. The displacement is u_z at the end of Γc on the x axis. Collective.
+    Half of the cells of an edge lie on Γc, which is 1.5 contact radii wide, and are cubes. The far
+    sides are fixed. The displacement is u_z at the end of Γc on the x axis. Collective.
     """
     mesh = dolfinx.mesh.create_unit_cube(
         MPI.COMM_WORLD, *(cells,) * 3, dolfinx.mesh.CellType.hexahedron
@@ -337,15 +340,16 @@ def ball_on_block(cells: int, friction: float = 0.3) -> Body:
     )
 
 
-TAGGED_RADIUS, TAGGED_DEPTH = 2.0, 0.01  # of the ball on a cube; a = √(R d) = 0.14
+# Radius and indentation depth of the ball on a cube: a = √(R d) = 0.14.
+TAGGED_RADIUS, TAGGED_DEPTH = 2.0, 0.01
 
 
 @cache
 def ball_on_tagged_block(cells: int, friction: float = 0.3) -> Body:
-    """A rigid ball pressed on a unit cube of tetrahedra, ``cells`` along each edge.
+    """Return a rigid ball pressed on a unit cube of tetrahedra, ``cells`` along each edge.
 
-    All of the top is Γc, of which a sixteenth touches; the base is held. The displacement is that
-    below the ball's centre. Collective.
+    Γc is the whole top, of which a sixteenth is in contact; the base is fixed. The displacement is
+    u_z below the centre of the ball. Collective.
     """
     mesh = dolfinx.mesh.create_box(
         MPI.COMM_WORLD, [[-0.5, -0.5, -1.0], [0.5, 0.5, 0.0]], (cells,) * 3
@@ -372,12 +376,12 @@ def ball_on_tagged_block(cells: int, friction: float = 0.3) -> Body:
 
 
 def hertz_force() -> float:
-    """Of the ball on a half-space like the block, without friction: F = 4/3 E* √R d^(3/2)."""
+    """Return Hertz's force of the ball on a half-space of this material, F = 4/3 E* √R d^(3/2)."""
     return 4 / 3 / (1 - 0.3**2) * np.sqrt(RADIUS) * DEPTH**1.5
 
 
 def graded(cells: int) -> np.ndarray:
-    """Places of the nodes on an edge: equal cells on Γc, then growing by a constant factor."""
+    """Return node coordinates of an edge: equal cells on Γc, then growth by a constant factor."""
     near = cells // 2
     h, away = WIDTH / near, np.arange(1, cells - near + 1)
     growth = scipy.optimize.brentq(lambda q: h * np.sum(q**away) - (1 - WIDTH), 1.0, 3.0)
@@ -385,13 +389,13 @@ def graded(cells: int) -> np.ndarray:
 
 
 def _ball(radius: float, load: Any) -> dict[str, Any]:
-    """A ball that touches z = 0 at the origin and moves by ``load``."""
+    """Return a ball that touches z = 0 at the origin and moves along z by ``load``."""
     moved = ufl.as_vector([0, 0, load])
     return {"obstacle": fc.Ball((0, 0, radius), radius, displacement=moved)}
 
 
 def _by_hand_ball(x: Any, load: Any, radius: float = RADIUS) -> tuple[Any, Any, Any]:
-    """The same for forms by hand."""
+    """Return normal, gap and motion of that ball for the reference form."""
     arm = ufl.as_vector([0, 0, radius + load]) - x
     distance = ufl.sqrt(ufl.dot(arm, arm))
     return arm / distance, distance - radius, ufl.as_vector([0, 0, load])

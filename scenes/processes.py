@@ -1,4 +1,4 @@
-"""New processes that find this checkout, and are no part of the ranks that start them."""
+"""Subprocesses that import this checkout and do not join the MPI ranks that start them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def environment() -> dict[str, str]:
-    """What a new process gets: what mpirun left here would make another mpirun join it.
+    """Return the environment of a subprocess, without the variables of a surrounding mpirun.
 
-    More ranks than cores, for Open MPI 6, 5 and 4: MPICH does not know the option of its mpirun.
+    Environment variables allow more ranks than cores with Open MPI 6, 5 and 4; an option of mpirun
+    would be an error with MPICH.
     """
     kept = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX"))}
     kept.setdefault("PRTE_MCA_mapby", ":oversubscribe")
@@ -26,17 +27,17 @@ def environment() -> dict[str, str]:
 
 
 def command(ranks: int, *words: object) -> list[str]:
-    """Python with these words, on several ranks by mpirun."""
+    """Return the command that runs Python with these arguments on ``ranks`` ranks."""
     launch = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
     return [*launch, sys.executable, *map(str, words)]
 
 
 def answer(ranks: int, *words: object, seconds: float | None = None) -> Any:
-    """The last line that Python prints with these words, on several ranks by mpirun, as JSON.
+    """Run Python with these arguments on ``ranks`` ranks, and parse its last output line as JSON.
 
     Raises:
-        subprocess.CalledProcessError: It failed.
-        subprocess.TimeoutExpired: It took more than ``seconds``, and was ended.
+        subprocess.CalledProcessError: The process failed.
+        subprocess.TimeoutExpired: The process took more than ``seconds`` and was terminated.
     """
     done = subprocess.run(
         command(ranks, *words),
@@ -50,7 +51,10 @@ def answer(ranks: int, *words: object, seconds: float | None = None) -> Any:
 
 
 def run_demo(name: str, folder: Path, *options: str, ranks: int = 1) -> dict[str, Any]:
-    """Run ``demos/NAME.py``; it must end with 0 and stay silent on stderr. Its result.json."""
+    """Run ``demos/NAME.py``, and return its output and JSON result.
+
+    The demo must end with 0, and must not print a progress bar to stderr.
+    """
     words = command(ranks, ROOT / "demos" / f"{name}.py", *options, "--output", folder)
     done = subprocess.run(words, env=environment(), capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -59,5 +63,5 @@ def run_demo(name: str, folder: Path, *options: str, ranks: int = 1) -> dict[str
 
 
 def values(result: dict[str, Any]) -> dict[str, float]:
-    """What a demo found of all that it has references for."""
+    """Return a demo's values of all quantities that have references."""
     return {name: entry["value"] for name, entry in result["references"].items()}

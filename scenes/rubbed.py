@@ -1,9 +1,10 @@
-"""A small block of rubber with a rounded lower side, pressed on another one and dragged along it.
+"""A rubber block with a curved lower side, pressed on a larger rubber block and dragged along it.
 
-Plane strain: lower block [0, 6] x [0, 2], its bottom held; upper one [0.6, 2.6] x [2, 3], whose
-lower side is rounded off by 0.3 at both ends, its top led. Γc is the lower side of the upper one,
-whose cells are the finer ones. Both are neo-Hookean, W = G/2 (I₁ - 3 - 2 ln J) + λ/4 (J² - 1 - 2 ln
-J), the upper one twice as stiff. The geometry is simple enough to be given to other programs.
+Plane strain. The lower block [0, 6] x [0, 2] is fixed at its bottom. The upper one is [0.6, 2.6] x
+[2, 3], with a lower side raised by 0.3 at both ends, and a prescribed displacement of its top. Γc
+is the lower side of the upper block, which has the finer cells. Both are neo-Hookean, W = G/2 (I₁ -
+3 - 2 ln J) + λ/4 (J² - 1 - 2 ln J), the upper one twice as stiff. The geometry is simple, so that
+other programs can reproduce it.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from scenes.meshes import mesh_of
 from scenes.tags import between, near, tagged
 
 BOTTOM, TOP, LOWER, UPPER, SIDE = 1, 2, 3, 4, 5
-# Origin, size, cells along and up, modulus.
+# Origin, size, cells along x and y, and Young's modulus of both blocks.
 BLOCKS = (((0.0, 0.0), (6.0, 2.0), (24, 8), 1000.0), ((0.6, 2.0), (2.0, 1.0), (12, 6), 2000.0))
 NU, ROUND = 0.3, 0.3
 K_N, K_T = 2e4, 2e4
-PRESSED, DRAGGED = 4, 20  # increments
+PRESSED, DRAGGED = 4, 20  # numbers of increments
 DOWN, WAY = 0.2, 1.6
 PATH = (
     *((0.0, DOWN * i / PRESSED) for i in range(1, PRESSED + 1)),
@@ -36,10 +37,10 @@ PATH = (
 
 
 def rubbed_mesh(fine: int = 1) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """Both blocks in one mesh, and the tags of their facets. Collective.
+    """Return both blocks in one mesh, and the tags of their facets. Collective.
 
     Args:
-        fine: By how much cells are smaller than in `BLOCKS`.
+        fine: Refinement factor of the cells of `BLOCKS`.
     """
     x, cells, offset = [], [], 0
     for number, (origin, size, n, _) in enumerate(BLOCKS):
@@ -75,22 +76,22 @@ def rubbed_mesh(fine: int = 1) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags
 
 
 class Rubbed:
-    """The blocks, and one contact between them.
+    """The two blocks and the contact between them.
 
     Attributes:
         u: Displacement, quadratic.
-        residual: Of the bulk.
-        bcs: Conditions at `BOTTOM` and `TOP`.
+        residual: Residual of the bulk.
+        bcs: Dirichlet conditions at `BOTTOM` and `TOP`.
         contact: The contact.
-        tags: Of the facets.
+        tags: Facet tags.
     """
 
     def __init__(self, friction: float, fine: int = 1) -> None:
-        """Set it up. Collective.
+        """Create the blocks and the contact. Collective.
 
         Args:
-            friction: μ; 0: none.
-            fine: See `rubbed_mesh`.
+            friction: Friction coefficient μ; 0: frictionless.
+            fine: Refinement factor, see `rubbed_mesh`.
         """
         mesh, self.tags = rubbed_mesh(fine)
         V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
@@ -99,7 +100,7 @@ class Rubbed:
         middles = dolfinx.mesh.compute_midpoints(
             mesh, 2, np.arange(modulus.x.array.size, dtype=np.int32)
         )
-        # Of `DG 0` the dofs are the cells.
+        # The dofs of `DG 0` are numbered like the cells.
         modulus.x.array[:] = np.where(middles[:, 1] < BLOCKS[0][1][1], BLOCKS[0][3], BLOCKS[1][3])
         body = NeoHookean(self.u, modulus, NU, "plane strain")
         dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 4})
@@ -115,5 +116,5 @@ class Rubbed:
         self.contact = fc.Contact(self.u, surface, opposite, law, kinematics="finite")
 
     def lead(self, along: float, down: float) -> None:
-        """Move the top of the upper block."""
+        """Set the displacement of the top of the upper block."""
         self._top.value[:] = along, -down

@@ -1,4 +1,4 @@
-"""A block of rubber, its bottom held and moved as a rigid body, under a rigid tool."""
+"""A block of rubber with a prescribed motion of its bottom, in contact with a rigid tool."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from scenes.elasticity import displacement_space, strain
 from scenes.histories import History
 from scenes.surfaces import ball, circle, ring
 
-# So that results are compared, and not what the solver leaves.
+# Compared results must not differ by the residual of the solver.
 TIGHT = {"snes_rtol": 1e-13}
-# Of displacement and pressure.
+# Mixed elements for displacement and pressure.
 MIXED = ("Taylor-Hood", "MINI")
 
 
 @dataclass
 class Rubber:
-    """A block; its top is Γc, in the middle of which is the origin of x (and y).
+    """A block whose top is Γc; the middle of the top is the origin of x (and y).
 
     Attributes:
-        u: What is solved for.
-        displacement: In it (UFL).
+        u: Function that is solved for, with the pressure if the element is mixed.
+        displacement: Displacement, an expression of u (UFL).
         F: Residual of the bulk.
-        held: Displacement of the bottom.
+        held: Prescribed displacement of the bottom.
     """
 
     mesh: dolfinx.mesh.Mesh
@@ -54,14 +54,17 @@ class Rubber:
         return self.mesh.geometry.dim
 
     def place(self, motion: Callable[[Array], Array]) -> None:
-        """Move the bottom: places (dim, n) -> places."""
+        """Move the bottom by a map of positions (dim, n) to positions."""
         d = self.dim
         self.held.interpolate(lambda x: motion(x[:d]) - x[:d])
 
     def contact(
         self, obstacle: fc.Obstacle, law: Any, *, points_degree: int | None = None, **options: Any
     ) -> fc.Contact:
-        """Of the top, by finite kinematics; ``points_degree``: of the rule on Γc."""
+        """Return the contact of the top, by default with finite kinematics.
+
+        ``points_degree`` is the quadrature degree on Γc.
+        """
         surface = fc.ContactSurface(self.mesh, self.tags, TOP, quadrature_degree=points_degree)
         options = {"kinematics": "finite", "weight": self.body.weight} | options
         return fc.Contact(self.displacement, surface, obstacle, law, **options)
@@ -69,7 +72,7 @@ class Rubber:
     def problem(
         self, obstacle: fc.Obstacle, law: Any, *, contact: dict | None = None, **options: Any
     ) -> tuple[fc.ContactProblem, fc.Contact]:
-        """The problem and its one contact; ``contact``: arguments of `Rubber.contact`."""
+        """Return the problem and its contact; ``contact`` has arguments of `Rubber.contact`."""
         made = self.contact(obstacle, law, **(contact or {}))
         problem = fc.ContactProblem(self.F, self.u, bcs=self.bcs, contacts=[made], **options)
         return problem, made
@@ -89,9 +92,9 @@ def rubber(
     kind: str | None = None,
     **mesh_arguments: Any,
 ) -> Rubber:
-    """A `Rubber` of the last of the sizes in height; ``linear``: at small strains instead.
+    """Return a `Rubber` whose height is the last of the sizes; small strains if ``linear``.
 
-    ``mixed``: with a pressure, in one of `MIXED` elements, of which ``degree`` is not asked.
+    With ``mixed``, one of `MIXED`, the pressure is a second unknown, and ``degree`` is ignored.
     """
     d = dimension(cell)
     size = np.asarray(size or [2.0] * (d - 1) + [1.0])
@@ -112,7 +115,7 @@ def rubber(
 
 
 def mixed_space(mesh: dolfinx.mesh.Mesh, name: str) -> fem.FunctionSpace:
-    """Displacement, bubbles if there are any, and pressure; the name is one of `MIXED`."""
+    """Return the space of displacement, bubbles (MINI) and pressure; the name is in `MIXED`."""
     cell, d = mesh.topology.cell_name(), mesh.geometry.dim
     degree = 2 if name == "Taylor-Hood" else 1
     parts = [basix.ufl.element("P", cell, degree, shape=(d,))]
@@ -123,7 +126,7 @@ def mixed_space(mesh: dolfinx.mesh.Mesh, name: str) -> fem.FunctionSpace:
 
 
 def split(fields: Sequence[Any]) -> tuple[Any, Any]:
-    """Displacement and pressure of the parts of a function, or test functions of both."""
+    """Return displacement and pressure from the components of a function or test function."""
     first, *bubbles, last = fields
     return sum(bubbles, first), last
 
@@ -139,12 +142,12 @@ def _mixed(
     isochoric: bool,
     linear: bool,
 ) -> Rubber:
-    """A `Rubber` with a pressure."""
+    """Return a `Rubber` with the pressure as second unknown."""
     W = mixed_space(mesh, name)
     w = fem.Function(W, name="w")
     (u, p), (v, q) = split(ufl.split(w)), split(ufl.TestFunctions(W))
     body = NeoHookean(u, E, nu, kind, isochoric=isochoric, pressure=p)
-    # UFL would take thousands of points a cell for bubbles in a nonlinear form.
+    # UFL would choose thousands of quadrature points per cell for bubbles in a nonlinear form.
     dx = ufl.Measure("dx", mesh, metadata={"quadrature_degree": 6} if name == "MINI" else {})
     if linear:
         G = E / (2 * (1 + nu))
@@ -172,12 +175,12 @@ def disc(
     axis: Sequence[float] = (0, 1, 0),
     shape: str = "ball",
 ) -> fc.Obstacle:
-    """A rigid disc or ball that touches the middle of the top; it turns about its centre.
+    """Return a rigid disc or ball that touches the middle of the top.
 
-    By ``angle``, or by ``moment``, or not at all.
+    Its rotation about its centre is given by ``angle``, or by ``moment``, or is zero.
 
-    ``shape``: "ball" is exact; "profile" is a spline through 60 points, turned in space; "facets"
-    are 24 segments in the plane, 512 triangles in space.
+    ``shape``: "ball" is exact; "profile" is a spline through 60 points in the plane, and a solid of
+    revolution in space; "facets" are 24 segments in the plane and 512 triangles in space.
     """
     d = scene.dim
     centre = np.array((0.0,) * (d - 1) + (scene.height + radius,))
@@ -199,10 +202,10 @@ def disc(
 
 
 class Tool(History):
-    """A disc that presses, is dragged and turns, on a block of rubber.
+    """A disc that is pressed into a block of rubber, dragged and rotated.
 
     Attributes:
-        shift, angle: Of the disc.
+        shift, angle: Displacement and angle of rotation of the disc.
     """
 
     def __init__(
@@ -218,18 +221,18 @@ class Tool(History):
         solver: dict | None = None,
         **options: Any,
     ) -> None:
-        """Make the scene.
+        """Create block, disc and problem.
 
         Args:
-            cell: Of the block.
-            law: Of the contact.
-            radius: Of the disc.
-            contact: Arguments of the `Contact`.
+            cell: Cell type of the block.
+            law: Contact law, by default Coulomb's.
+            radius: Radius of the disc.
+            contact: Arguments of `Rubber.contact`.
             force: Whether the disc is pressed by a force, ``down``, instead of a displacement.
-            driven: Whether the disc is turned by a ``moment``, instead of an angle.
-            shape: Of the disc, see `disc`.
+            driven: Whether the disc is rotated by a ``moment`` instead of an angle.
+            shape: Shape of the disc, see `disc`.
             solver: Arguments of the problem.
-            options: Of `rubber`.
+            options: Arguments of `rubber`.
         """
         space = cell in ("tetrahedron", "hexahedron")
         options = {"n": (4, 2) if space else (12, 6), "degree": 1 if space else 2} | options
@@ -254,7 +257,7 @@ class Tool(History):
         )
 
     def load(self, t: float) -> None:
-        """Down until 1, along and turned until 2, back and turned on until 4."""
+        """Press until t = 1, drag and rotate until 2, drag back and rotate further until 4."""
         down, along = min(t, 1.0), np.interp(t, [1, 2, 4], [0, 0.1, -0.1])
         self.shift.value[:] = self.vector(along, -0.12 * down)
         self.down.value, self.side.value = -60.0 * down, along
@@ -262,28 +265,28 @@ class Tool(History):
         self.moment.value = 3.0 * np.interp(t, [1, 2, 4], [0, 1, -1])
 
     def vector(self, side: float, up: float) -> Array:
-        """Components along x and along the height."""
+        """Return the vector with components ``side`` along x and ``up`` along the height."""
         value = np.zeros(self.scene.dim)
         value[0], value[-1] = side, up
         return value
 
     def go(self, side: float, up: float, angle: float = 0.0) -> fc.Step:
-        """One increment of the disc to a place and angle."""
+        """Solve and commit one increment with this displacement and angle of the disc."""
         self.shift.value[:], self.angle.value = self.vector(side, up), angle
         step = self.problem.solve()
         self.problem.commit()
         return step
 
     def resultant(self) -> Array:
-        """The contact force on the body."""
+        """Return the contact force on the body."""
         return self.contact.resultants().force
 
     def tractions(self) -> Array:
-        """On the body at all points, ordered by their places in the undeformed body."""
+        """Return the tractions at all points, ordered by their undeformed coordinates."""
         return at_points(self.contact, self.contact.traction)
 
 
 def domed(x):
-    """The top of a block [0, 2] x [0, 1] bent to a circle of radius 2 about (1, -1)."""
+    """Bend the top of a block [0, 2] x [0, 1] to a circle of radius 2 about (1, -1)."""
     top = np.sqrt(4 - (x[:, 0] - 1) ** 2) - 1
     return np.column_stack([x[:, 0], x[:, 1] * top])

@@ -1,4 +1,4 @@
-"""A block on a round cushion, its top pushed down, to and fro: open, sticking, slipping points."""
+"""A block on a rigid ball, pressed and slid back and forth: points are open, stick and slip."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from scenes.comparing import at_points, close, nodal
 
 COMM = MPI.COMM_WORLD
 
-# On several ranks MUMPS adds in the order in which messages come: no two runs agree in the last
-# bit, and two solutions within the tolerance of 1e-9 on the residual are compared.
+# Relative difference of two solutions. On several ranks MUMPS sums in the order in which messages
+# arrive: runs differ by round-off, and the residual is only at most 1e-9 (relative).
 SAME = 0.0 if COMM.size == 1 else 1e-7
 
 
 def cushion(d: int, displacement: Any = None, *, length: float = 1.0) -> fc.Ball:
-    """A ball, or disc, twice as large as a block and just below the middle of its bottom."""
+    """Return a ball or disc of radius 2 ``length`` that touches the middle of a block's bottom."""
     center = np.full(d, 0.5 * length)
     center[-1] = -2.0 * length
     return fc.Ball(center, 2.0 * length, displacement=displacement)
 
 
 class Rub:
-    """The block, unloaded.
+    """A block on a ball, with a prescribed displacement of its top.
 
     Attributes:
         scene: The block.
         push: Displacement of the top, one constant per component.
-        contact, problem: As made.
+        contact, problem: The contact and its problem.
     """
 
     def __init__(
@@ -50,10 +50,10 @@ class Rub:
         contact: dict | None = None,
         **options: Any,
     ) -> None:
-        """Make it in units in which lengths and stresses are larger by the factors given.
+        """Create the unloaded problem, with lengths and stresses multiplied by the given factors.
 
-        ``reach`` is how far `load` goes to and fro; ``mesh``, ``contact`` and the other options are
-        arguments of `block_mesh`, of the contact, and of the problem.
+        ``reach`` is the amplitude of sliding in `load`; ``mesh``, ``contact`` and the other options
+        are arguments of `block_mesh`, of the contact, and of the problem.
         """
         d = dimension(cell)
         mesh = {"n": 4, "size": length * np.ones(d)} | (mesh or {})
@@ -73,30 +73,31 @@ class Rub:
         self.push[-1].value = -down
 
     def load(self, t: float) -> None:
-        """Down until 1, along until 2, and back until 4."""
+        """Press until t = 1, slide until 2, and slide back until 4."""
         self.move(np.interp(t, [1, 2, 4], [0, self.reach, -self.reach]), 0.03 * min(t, 1.0))
 
 
 class Aslant(Rub):
-    """The same, led down and half as far to the side in proportion."""
+    """A block on a ball whose top moves down, and half as far sideways, in proportion to t."""
 
     def load(self, t: float) -> None:
-        """All of it at 1."""
+        """Set the displacement of the top at t; it is complete at t = 1."""
         self.move(0.015 * t, 0.03 * t)
 
     def run(self, **options: Any) -> list[fc.Step]:
-        """All steps up to 1."""
+        """Return all steps up to t = 1."""
         return list(fc.increments(self.problem, self.load, **options))
 
 
-# Down, aside, further, back through zero, up again: (side, down) of the top.
+# Displacements (side, down) of the top: pressing, sliding, reversal beyond zero, and partial
+# unloading.
 PATH = [(0.0, 0.02), (0.002, 0.03), (0.02, 0.03), (0.016, 0.03), (-0.01, 0.03), (-0.01, 0.01)]
 
 
 def walk(
     made: Rub, length: float = 1.0, path: Sequence[tuple[float, float]] = PATH
 ) -> list[fc.Step]:
-    """Solve and commit the whole path."""
+    """Solve and commit all increments of the path."""
     steps = []
     for side, down in path:
         made.move(side * length, down * length)
@@ -106,7 +107,7 @@ def walk(
 
 
 def snapshot(made: Rub) -> tuple[Array, ...]:
-    """Displacement and history of this rank."""
+    """Return copies of this rank's displacement and contact history."""
     history = made.contact.history.function.x.array.copy()
     return made.scene.u.x.array.copy(), history
 
@@ -121,14 +122,14 @@ def pressed(
     n: int = 4,
     **options: Any,
 ) -> tuple[Block, fc.ContactProblem, fc.Contact]:
-    """A `Rub` that is loaded, not solved, taken apart."""
+    """Return block, problem and contact of a loaded `Rub` that is not yet solved."""
     made = Rub(law, cell=cell, mesh={"n": n}, method=method, **options)
     made.move(side, down)
     return made.scene, made.problem, made.contact
 
 
 def same_states(a: Rub, b: Rub, rtol: float) -> bool:
-    """Displacements and histories; 0: bit for bit."""
+    """Return whether displacements and histories agree within ``rtol``; 0: bit for bit."""
     pairs = [
         [nodal(made.scene.u) for made in (a, b)],
         [at_points(made.contact, made.contact.history.rows()) for made in (a, b)],
@@ -139,7 +140,7 @@ def same_states(a: Rub, b: Rub, rtol: float) -> bool:
 
 
 def limited(made: Rub, largest: float) -> list[float]:
-    """Let increments fail whose load grows by more than ``largest``; returns those tried."""
+    """Make increments fail if t grows by more than ``largest``; return the list of attempted t."""
     solve, tried, at = made.problem.solve, [], [0.0]
     now = [0.0]
     load, commit = made.load, made.problem.commit
@@ -153,7 +154,7 @@ def limited(made: Rub, largest: float) -> list[float]:
         if now[0] - at[0] > largest:
             made.problem.solver.main.max_it, kept = 0, made.problem.solver.main.max_it
             made.problem.snes.setTolerances(max_it=0)
-            made.problem.solver.predictor.predict = False  # that guess can be the solution
+            made.problem.solver.predictor.predict = False  # its result can be the solution
             try:
                 return solve(**kwargs)
             finally:

@@ -1,4 +1,4 @@
-"""A sound scene, to be spoilt in one respect."""
+"""A valid contact problem, in which tests change one input to an invalid one."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from dolfinx import fem
 import fenics_contact as fc
 from scenes.blocks import Block, block
 
-# Four layers of cells, so that on two and three ranks some rank has no part in a fault.
+# Four layers of cells, so that on two and three ranks a fault does not concern all ranks.
 MESH = {"n": (2, 4)}
 
 
 def pressed(**options: Any) -> Block:
-    """A block pressed down with a pressure of one."""
+    """Return a block with a pressure of 1 on its top."""
     return block("quadrilateral", up=-1.0, **MESH, **options)
 
 
 def coulomb(friction: Any = 0.3, k_n: Any = 1e4, k_t: Any = 1e3) -> fc.Coulomb:
-    """A law that carries it."""
+    """Return a valid Coulomb law for the pressed block."""
     return fc.Coulomb(friction, k_n=k_n, k_t=k_t)
 
 
@@ -31,7 +31,7 @@ def build_and_solve(
     contact: dict | None = None,
     **options: Any,
 ) -> Callable[[], fc.Step]:
-    """A call that makes the problem and solves it once."""
+    """Return a function that creates the problem and solves it once."""
 
     def call() -> fc.Step:
         conditions = scene.rollers() if bcs is None else bcs

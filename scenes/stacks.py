@@ -1,4 +1,4 @@
-"""Bodies of unequal meshes in one mesh: blocks one on the other, rings one in the other."""
+"""Bodies with non-matching cells in one mesh: stacked blocks and concentric rings."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def stack(
     nu: float = 0.0,
     tags: Mapping[int, Where] | None = None,
 ) -> Bodies:
-    """Blocks one on the other, ``counts`` cells along x in each, ``apart`` from each other.
+    """Return stacked blocks with ``counts`` cells along x, and gaps of ``apart`` between them.
 
-    Tags: FLOOR, ROOF, SIDES (all upright faces), and both faces of joint j, counted from 1 at the
-    top of the lowest block: 10 j + LOWER and 10 j + UPPER.
+    Tags: FLOOR, ROOF, SIDES (all vertical faces), and 10 j + LOWER and 10 j + UPPER for the faces
+    below and above joint j, numbered from 1 at the top of the lowest block.
     """
     d = 3 if cell == "hexahedron" else 2
     widths = widths or [1.0] * len(counts)
@@ -58,14 +58,14 @@ def stack(
 
 
 def joint(body: Bodies, j: int, law: Any, *, swap: bool = False, **options: Any) -> fc.Contact:
-    """Contact of the blocks over and under joint ``j``."""
+    """Return the contact at joint ``j``; Γc is its upper face, or with ``swap`` its lower face."""
     here, there = (LOWER, UPPER) if swap else (UPPER, LOWER)
     name = f"joint {j}"
     return body.contact(10 * j + here, 10 * j + there, law, name=name, **options)
 
 
 def floor(body: Bodies, law: Any, tag: int = FLOOR, **options: Any) -> fc.Contact:
-    """Contact of a side with a floor that it just touches."""
+    """Return the contact of a side with the half-space below height 0."""
     up = np.eye(body.d)[-1]
     return body.contact(tag, fc.HalfSpace(0 * up, up), law, name="floor", **options)
 
@@ -74,9 +74,10 @@ def floor(body: Bodies, law: Any, tag: int = FLOOR, **options: Any) -> fc.Contac
 
 
 def rings(counts: tuple[int, int], *, degree: int = 2, angle: float = 1.5) -> Bodies:
-    """Sectors of two rings, 10/20 and 20/40, of as many cells along the angle, curved if quadratic.
+    """Return sectors of two rings with radii 10/20 and 20/40, and ``counts`` cells along the angle.
 
-    Tags: LOWER and UPPER, their joint; FLOOR and ROOF, their cuts; OUTSIDE.
+    Cells are curved if quadratic. Tags: LOWER and UPPER at the joint; FLOOR and ROOF at the ends of
+    the sectors; OUTSIDE.
     """
     axes = [
         [np.linspace(0, angle, n + 1), np.linspace(*radii, 4)]
@@ -96,11 +97,11 @@ def rings(counts: tuple[int, int], *, degree: int = 2, angle: float = 1.5) -> Bo
     return Bodies(boxes(axes, sides, bend=bend, degree=degree), E, 0.3, degree=degree)
 
 
-# ---- what acts -----------------------------------------------------------------------------------
+# ---- contact forces ------------------------------------------------------------------------------
 
 
 def nodal_forces(contact: fc.Contact) -> tuple[Array, Array]:
-    """Contact's forces at the nodes of this rank and where these are, (n, d) each."""
+    """Return the contact forces at the nodes of this rank and their coordinates, (n, d) each."""
     space = contact.u.function_space
     force = fem.Function(space)
     fc.ContactOperator(contact).add_force(force.x.petsc_vec)
@@ -109,7 +110,7 @@ def nodal_forces(contact: fc.Contact) -> tuple[Array, Array]:
 
 
 def balance(contact: fc.Contact) -> tuple[Array, float, float]:
-    """Sum of the forces, of their moments about the origin, and of their sizes."""
+    """Return sums of nodal forces, their moments about the origin and component magnitudes."""
     f, x = nodal_forces(contact)
     i = contact.surface.mesh.geometry.dim - 1
     moment = x[:, 0] * f[:, i] - x[:, i] * f[:, 0]
@@ -121,6 +122,6 @@ def balance(contact: fc.Contact) -> tuple[Array, float, float]:
 
 
 def uniform(values: Array, expected: float, rtol: float = 1e-9) -> bool:
-    """Whether values are everywhere what is expected, on all ranks."""
+    """Return whether all values equal ``expected`` within ``rtol``, on all ranks."""
     values = gathered(COMM, values)
     return close(values, np.full(values.shape, expected), rtol)

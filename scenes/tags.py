@@ -1,4 +1,4 @@
-"""Tags of the facets of the boundary, by where their nodes or their midpoints lie."""
+"""Tags of boundary facets, selected by the coordinates of their nodes or midpoints."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from fenics_contact.types import Array
 
-# Which ones of facets: of their midpoints and of those of the cells that they bound, both (n, d).
+# Selects facets by the midpoints of the facets and of their cells, both (n, d).
 Where = Callable[[Array, Array], Array]
 
 
@@ -19,19 +19,19 @@ Where = Callable[[Array, Array], Array]
 def sides(
     mesh: dolfinx.mesh.Mesh, where: Mapping[int, Callable[[Array], Array]]
 ) -> dolfinx.mesh.MeshTags:
-    """Tags of the facets whose nodes (3, n) all lie where it is said. Collective."""
+    """Return tags of the facets all of whose nodes (3, n) are selected. Collective."""
     dim = mesh.topology.dim - 1
     mesh.topology.create_entities(dim)
     found = {t: dolfinx.mesh.locate_entities_boundary(mesh, dim, at) for t, at in where.items()}
     facets = np.concatenate(list(found.values()))
     values = np.repeat(np.array(list(found), dtype=np.int32), [len(f) for f in found.values()])
-    # A facet of several sides has the tag of the last.
+    # A facet that is selected several times has the last of its tags.
     facets, first = np.unique(facets[::-1], return_index=True)
     return dolfinx.mesh.meshtags(mesh, dim, facets, values[::-1][first])
 
 
 def plane(i: int, value: float) -> Callable[[Array], Array]:
-    """Nodes at the coordinate ``i``."""
+    """Return a selector of the nodes with x_i = ``value``."""
     return lambda x: np.isclose(x[i], value)
 
 
@@ -39,7 +39,7 @@ def plane(i: int, value: float) -> Callable[[Array], Array]:
 
 
 def tagged(mesh: dolfinx.mesh.Mesh, where: Mapping[int, Where]) -> dolfinx.mesh.MeshTags:
-    """Tags of the facets that functions of midpoints choose; of several the last. Collective."""
+    """Return tags of facets selected by midpoints; the last selector has priority. Collective."""
     d = mesh.topology.dim
     mesh.topology.create_connectivity(d - 1, d)
     to_cell = mesh.topology.connectivity(d - 1, d)
@@ -55,16 +55,16 @@ def tagged(mesh: dolfinx.mesh.Mesh, where: Mapping[int, Where]) -> dolfinx.mesh.
 
 
 def near(i: int, value: float) -> Where:
-    """Facets whose midpoint lies at the coordinate ``i``."""
+    """Return a selector of the facets whose midpoints have x_i = ``value``, within 1e-9."""
     return lambda x, cell: np.abs(x[:, i] - value) < 1e-9
 
 
 def between(i: int, value: float, *, above: bool) -> Where:
-    """The same, of the cells on one side."""
+    """Return a selector of the facets at x_i = ``value`` whose cells are on one side of it."""
     side = 1 if above else -1
     return lambda x, cell: near(i, value)(x, cell) & (side * (cell[:, i] - value) > 0)
 
 
 def either(*choices: Where) -> Where:
-    """Facets that one of several chooses."""
+    """Return a selector of the facets that at least one of the given selectors selects."""
     return lambda x, cell: np.any([choice(x, cell) for choice in choices], axis=0)

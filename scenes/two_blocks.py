@@ -1,4 +1,4 @@
-"""One block on another in one mesh, cells that do not match: pressed, or slid along it."""
+"""Two stacked blocks in one mesh with non-matching cells, pressed together or sliding."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ E = 1e6
 def two_blocks(
     cell: str, n: tuple[int, int], widths: tuple[float, float] = (1.0, 1.0), shift: float = 0.0
 ) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
-    """Two stacked blocks of height 1/2 whose meshes do not match, and their tags. Collective.
+    """Return two stacked blocks of height 1/2 with non-matching cells, and tags. Collective.
 
-    The upper one stands ``shift`` along x, and in its middle across.
+    A positive ``shift`` moves the upper block along x, and centres it across.
     """
     d = dimension(cell)
     x, cells, offset = [], [], 0
@@ -65,7 +65,10 @@ def pressed(
     contact: dict | None = None,
     **options: Any,
 ) -> tuple[fc.ContactProblem, fc.Contact, fem.Constant]:
-    """Two blocks on rollers, the top moved down by 0.01; the sides held if confined. Collective."""
+    """Return two blocks on rollers, pressed by 0.01, as problem, contact and load. Collective.
+
+    Both sides have zero normal displacement if ``confined``, otherwise those at 0 only.
+    """
     mesh, tags = two_blocks(cell, n)
     d = mesh.geometry.dim
     space = displacement_space(mesh, degree)
@@ -88,12 +91,12 @@ def pressed(
 
 
 class Slider:
-    """A block of width 1 that stands at ``start`` on one of width 4, its top moved.
+    """A block of width 1 at x = ``start`` on a block of width 4, with a prescribed top.
 
     Attributes:
-        u: Displacement of both.
-        move: That of the top, one constant per component.
-        contact, problem: As made.
+        u: Displacement of both blocks.
+        move: Displacement of the top, one constant per component.
+        contact, problem: The contact and its problem.
     """
 
     def __init__(
@@ -109,7 +112,7 @@ class Slider:
         contact: dict | None = None,
         **options: Any,
     ) -> None:
-        """Make it, unloaded; both blocks rise along x by ``slope``. Collective."""
+        """Create the unloaded problem; both blocks rise along x by ``slope``. Collective."""
         mesh, tags = two_blocks(cell, n, (4.0, 1.0), start)
         d = mesh.geometry.dim
         mesh.geometry.x[:, d - 1] += slope * mesh.geometry.x[:, 0]
@@ -127,7 +130,7 @@ class Slider:
         self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=[self.contact], **options)
 
     def step(self, down: float, along: float) -> fc.Step:
-        """Move the top, solve and commit."""
+        """Set the displacement of the top, solve and commit."""
         self.move[-1].value, self.move[0].value = -down, along
         step = self.problem.solve()
         self.problem.commit()

@@ -1,4 +1,4 @@
-"""Files for ParaView, read back by their format alone: XML, arrays in base64."""
+"""Read VTK files for ParaView (XML with base64 arrays), independently of the package."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from fenics_contact.types import Array
 
 @dataclass
 class Read:
-    """What a file holds.
+    """The contents of a VTK file.
 
     Attributes:
-        kind: VTK's number of the cells, all of one kind.
-        x: Places of the nodes, (n_cells, n_nodes, 3).
-        at_nodes: Fields, (n_cells, n_nodes) or (n_cells, n_nodes, k).
-        in_cells: Fields, (n_cells,).
-        numbers: Of the whole.
+        kind: VTK's number of the cell type, the same for all cells.
+        x: Coordinates of the nodes, (n_cells, n_nodes, 3).
+        at_nodes: Point data, (n_cells, n_nodes) or (n_cells, n_nodes, k).
+        in_cells: Cell data, (n_cells,).
+        numbers: Field data of the whole file.
     """
 
     kind: int
@@ -32,14 +32,14 @@ class Read:
 
 
 def series(path: Path) -> list[tuple[float, str]]:
-    """Times and names of the files of a collection."""
+    """Return times and file names of a collection."""
     root = ElementTree.parse(path).getroot()
     assert root.tag == "VTKFile" and root.get("type") == "Collection"
     return [(float(e.get("timestep")), e.get("file")) for e in root.iter("DataSet")]
 
 
 def read(path: Path) -> Read:
-    """An unstructured grid of one piece."""
+    """Read an unstructured grid of one piece."""
     root = ElementTree.parse(path).getroot()
     assert root.get("type") == "UnstructuredGrid" and root.get("header_type") == "UInt64"
     assert root.get("byte_order") == "LittleEndian"

@@ -1,4 +1,4 @@
-"""Teardown that all ranks go through together, as in DOLFINx's own tests; an end to deadlocks."""
+"""Pytest configuration: collective teardown, deadlock timeout, cached forms and slow cases."""
 
 import faulthandler
 import gc
@@ -15,28 +15,28 @@ import pytest
 from ffcx.codegeneration import jit
 from mpi4py import MPI
 
-# Assertions of the scenes tell what differs, too.
+# Assertions in `scenes` report the values that differ.
 pytest.register_assert_rewrite("scenes")
-# Where traces go: the error stream as it is while pytest does not capture it.
+# File descriptor for traces: the error stream that pytest does not capture.
 _stderr = 2
-# A rank that waits for another inside C++ holds the interpreter's lock, so that no other timeout
-# gets to act. Four times the longest test.
+# A rank that waits for another one inside C++ holds the interpreter lock, so that Python timeouts
+# cannot act. The value is four times the duration of the longest test.
 _DEADLOCK_SECONDS = 300
 _found_by_ffcx = jit.get_cached_module
 _forms: dict[Path, ModuleType] = {}
 
 
 def pytest_configure() -> None:
-    """Keep the error stream; load compiled forms by name."""
+    """Duplicate the error stream before it is captured; make FFCx load compiled forms by name."""
     global _stderr
     _stderr = os.dup(2)
     jit.get_cached_module = _form
 
 
 def _form(name: str, objects: list[str], folder: Path, timeout: float) -> tuple[Any, Any]:
-    """A compiled form, loaded once by its name, without a list of the folder of all of them.
+    """Load a compiled form once by its name, without listing the cache folder.
 
-    FFCx lists it for each form that is made: of ten thousand files that is half of the tests' time.
+    FFCx lists the folder for each form, which takes half of the tests' time at ten thousand files.
     """
     path = Path(folder) / f"{name}{EXTENSION_SUFFIXES[0]}"
     if path not in _forms:
@@ -52,10 +52,10 @@ def _form(name: str, objects: list[str], folder: Path, timeout: float) -> tuple[
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the cases of parametrized tests that do not run by default as slow.
 
-    The first and the last case run, which differ in all parameters; with ``@pytest.mark.each``
-    every value of each parameter, in as few cases; with ``@pytest.mark.whole`` all. On several
-    ranks the last case runs. What runs on all kinds of cells is slow on hexahedra, whose forms take
-    longest to compile, except in modules marked ``hexahedra``.
+    By default the first and the last case run, which differ in all parameters. With
+    ``@pytest.mark.each`` few cases run that include every value of each parameter, with
+    ``@pytest.mark.whole`` all cases. On several ranks only the last case runs. Cases on hexahedra,
+    whose forms take longest to compile, are slow except in modules marked ``hexahedra``.
     """
     cases = defaultdict(list)
     for item in items:
@@ -79,7 +79,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _each(cases: list[pytest.Item]) -> list[pytest.Item]:
-    """First the cases of which no value has been seen, then those of which not all have been."""
+    """Return cases that include every parameter value; those with only new values come first."""
     kept: list[pytest.Item] = []
     seen: set[tuple[str, str]] = set()
     for enough in (set.isdisjoint, lambda values, seen: not values <= seen):
@@ -92,7 +92,7 @@ def _each(cases: list[pytest.Item]) -> list[pytest.Item]:
 
 
 def pytest_exception_interact(report: pytest.TestReport) -> None:
-    """In parallel, show at once what failed: the end of the run may never come."""
+    """In parallel, print failures at once, since the end of the run may not be reached."""
     if MPI.COMM_WORLD.size > 1:
         text = f"\nrank {MPI.COMM_WORLD.rank}, {report.nodeid}:\n{report.longreprtext}\n"
         os.write(_stderr, text.encode())
@@ -100,7 +100,7 @@ def pytest_exception_interact(report: pytest.TestReport) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol() -> Iterator[None]:
-    """In parallel, show where every rank hangs and end the run, instead of waiting forever."""
+    """In parallel, end the run after a timeout, and print the traceback of every waiting rank."""
     if MPI.COMM_WORLD.size > 1:
         faulthandler.dump_traceback_later(_DEADLOCK_SECONDS, exit=True, file=_stderr)
     try:
@@ -111,13 +111,13 @@ def pytest_runtest_protocol() -> Iterator[None]:
 
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown(item: pytest.Item) -> None:
-    """Destroy objects on all ranks at once: destructors of PETSc and DOLFINx may be collective."""
+    """Collect garbage on all ranks at once: destructors of PETSc and DOLFINx may be collective."""
     if MPI.COMM_WORLD.size > 1:
         gc.collect()
         MPI.COMM_WORLD.barrier()
 
 
 def pytest_sessionstart() -> None:
-    """In parallel, collect garbage between tests alone: what errors keep is freed there."""
+    """In parallel, disable automatic garbage collection; teardown frees objects kept by errors."""
     if MPI.COMM_WORLD.size > 1:
         gc.disable()

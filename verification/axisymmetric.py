@@ -1,4 +1,4 @@
-"""Axisymmetric verification cases."""
+"""Verification cases with axial symmetry."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ SIZE = (100.0, 200.0)  # radius and height of the base
 def punch(h: float = 1.0) -> Outcome:
     """Press a flat steel punch with a fillet on aluminium by 100 MPa.
 
-    M is the intersection of axis and contact. The pressure at the edge is singular; cells of size
-    ``h`` there.
+    M is the intersection of axis and contact. At the edge the pressure is singular, and cells have
+    size ``h``.
     """
     mesh, tags = _bodies(h)
     V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
@@ -52,7 +52,7 @@ def punch(h: float = 1.0) -> Outcome:
         contact = fc.Contact(u, surface, seat, law, weight=body.weight)
         problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
         list(fc.increments(problem, pressure, 0.0, 100.0, steps=10 if friction else 1))
-        # Both bodies have a node there; their displacements differ by the penetration.
+        # Both bodies have a node at M; their displacements differ by the penetration.
         found[friction] = float(output.at_node(u, (0.0, 0.0))[1])
         name = f"u_y(M) [mm], μ = {friction:g}"
         rows.append(Row(name, found[friction], published, "Konter, NAFEMS 2006", 0.01))

@@ -2,8 +2,8 @@
 
 python verification/campaigns.py
 
-Counts the rows of ``verification/campaign*.csv``, which `verification/fuzz.py` wrote; computes no
-scenes.
+The outcomes are the rows of ``verification/campaign*.csv``, written by `verification/fuzz.py`; no
+scenes are solved.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CAMPAIGNS = {
     "finite kinematics, two bodies": ("campaign_bodies.csv", "1"),
     "the same, dissimilar bodies": ("campaign_unlike.csv", "1"),
 }
-# Outcomes on the page, by their names in the files, with colours.
+# Labels and colours of the outcomes on the page, by their names in the files.
 OUTCOMES = {
     "right": ("correct", "#4c9f70"),
     "another": ("other equilibrium", "#a3c9a8"),
@@ -40,7 +40,7 @@ OUTCOMES = {
     "crashed": ("crashed", "#7a3b69"),
     "wrong": ("wrong", "#d1342f"),
 }
-# Reasons of refusal, by their names in the file.
+# Reasons for refusal on the page, by their names in the file.
 REASONS = {
     "ValueError: not held": "a body is unconstrained",
     "ValueError: load not balanced": "no contact force can balance the load",
@@ -51,7 +51,7 @@ Row = dict[str, str]
 
 
 def campaigns() -> dict[str, list[Row]]:
-    """Return the rows of all campaigns."""
+    """Return the rows of every campaign by its title."""
     files = {name: report.read(DATA / name) for name, _ in CAMPAIGNS.values()}
     return {
         title: [row for row in files[name] if row["ranks"] == ranks]
@@ -206,7 +206,7 @@ def page(found: dict[str, list[Row]]) -> str:
 
 
 def draw(path: Path, found: dict[str, list[Row]]) -> None:
-    """Draw the fractions of outcomes by campaign."""
+    """Draw the fractions of the outcomes of every campaign."""
     titles = [f"{title} ({len(rows)})" for title, rows in found.items()]
     with plotting.figure(path, size=(9.0, 3.4)) as axes:
         left = [0.0] * len(found)

@@ -102,7 +102,7 @@ class Case:
     Attributes:
         name: Title.
         reason: Reason of the tolerances.
-        compute: The computation; collective.
+        compute: Function that solves the case; collective.
         slow: Whether it takes more than some seconds.
         budget: Why error estimates cannot be compared with a true error.
     """
@@ -114,7 +114,7 @@ class Case:
     budget: str = ""
 
     def run(self) -> Outcome:
-        """Compute, and measure the time. Collective."""
+        """Solve the case, and measure the time. Collective."""
         start = time.perf_counter()
         made = self.compute()
         return dataclasses.replace(made, seconds=time.perf_counter() - start)
@@ -136,5 +136,5 @@ def case(
 
 
 def cases_of(*modules: ModuleType) -> list[Case]:
-    """Return the cases of modules, in order."""
+    """Return the cases of modules, in the order of registration."""
     return [c for module in modules for c in _cases if c.compute.__module__ == module.__name__]

@@ -35,7 +35,7 @@ def run(name: str, *options: str) -> dict[str, Any]:
 
 
 def runs(result: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the runs of a demo, one or several."""
+    """Return the results of all runs of a demo."""
     return result.get("runs", [result])
 
 
@@ -48,16 +48,16 @@ def demo(
     label: str = "",
     budget: str = "",
 ) -> Case:
-    """Create a case of a demo that has value, reference and tolerance under "references".
+    """Create a case from a demo that writes value, reference and tolerance under "references".
 
     Args:
         title: Title of the case.
         reason: Reason of the tolerances.
         name: Name of the demo.
         options: Options of the command line.
-        source: Sources of the references by a word of their names; the first that fits is used.
-        label: Key that distinguishes the runs.
-        budget: As in `Case`.
+        source: Sources of the references by a word of the quantity; the first match is used.
+        label: Key of the results that distinguishes the runs.
+        budget: Why error estimates cannot be compared with a true error.
     """
 
     def compute() -> Outcome:

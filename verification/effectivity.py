@@ -5,9 +5,9 @@
     python verification/effectivity.py --page          # page and figure of stored values
 
 Each part of the error budget is verified on the half-cylinder, where one cause of error at a time
-can be removed; all parts together on the verification cases, also on coarser meshes, that have
-exact or converged values for quantities of the budget. The exit code is 1 if a median effectivity
-is outside of 0.3 to 3.
+can be removed. All parts together are verified on the verification cases with exact or converged
+values for quantities of the budget, also on coarser meshes. The exit code is 1 if a median
+effectivity is outside of 0.3 to 3.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Row:
         quantity: Quantity of the budget.
         estimated: Estimated error.
         true: True error.
-        known: Uncertainty of the reference, below which the effectivity is unknown.
+        known: Uncertainty of the reference, below which the true error is unknown.
     """
 
     scene: str
@@ -63,7 +63,7 @@ class Row:
 
     @property
     def effectivity(self) -> float | None:
-        """Estimated over true error, without signs; None if the true error is not known."""
+        """Absolute value of estimated over true error; None if the true error is unknown."""
         return abs(self.estimated / self.true) if abs(self.true) > self.known else None
 
 
@@ -93,7 +93,7 @@ def half_cylinder(
 def part(
     name: str, scene: str, rough: tuple[Any, fc.ErrorBudget], better: dict[str, float]
 ) -> Iterator[Row]:
-    """Compare one part of a budget with a solution without this error."""
+    """Yield one part of a budget, compared with a solution without this error."""
     values, budget = rough
     for quantity, value in values.items():
         true = (value - better[quantity]) / value
@@ -199,7 +199,7 @@ WHOLES: list[tuple[str, tuple[str, ...], Truths, float]] = [
 
 
 def of_demos() -> Iterator[Row]:
-    """Yield all parts together for the demos, compared with exact or converged values."""
+    """Yield the total errors of the demos, compared with exact or converged values."""
     for name, options, truths, known in WHOLES:
         for one in runs(run(name, *options, "--errors")):
             budget = fc.ErrorBudget(**one["errors"])
@@ -210,20 +210,20 @@ def of_demos() -> Iterator[Row]:
                 value = budget.values[quantity]
                 whole = quantity == "normal force" and name == "sphere"
                 if whole and one["case"] != "block":
-                    continue  # Hertz's relation of depth and force holds for the block only
+                    continue  # Hertz's relation of depth and force is valid for the block only
                 if isinstance(given, str):
                     given = next(e["reference"] for n, e in references.items() if given in n)
                 if whole:
                     given = given / 4  # a quarter is modelled
                 true = (value - given) / value
-                # The references are for small displacements as well.
+                # The references also assume small displacements.
                 parts = {n: p for n, p in budget.parts.items() if n != "kinematics"}
                 total = dataclasses.replace(budget, parts=parts).total[quantity]
                 yield Row(label, "all parts", quantity, total, true, known)
 
 
 def of_cases() -> Iterator[Row]:
-    """Yield all parts together for the other cases, two of them on coarser meshes, too."""
+    """Yield the total errors of the other cases, and of two of them on coarser meshes."""
 
     def rows(title: str, made: Outcome) -> Iterator[Row]:
         for e in made.estimates() if made.estimates else ():
@@ -241,7 +241,7 @@ def of_cases() -> Iterator[Row]:
 
 
 def stored(row: Row) -> dict[str, Any]:
-    """Return the row of the CSV file."""
+    """Return a row as it is written to the CSV file."""
     found: dict[str, Any] = {"part": row.part, "case": row.scene, "quantity": row.quantity}
     found |= {"estimated [%]": 100 * row.estimated, "true [%]": 100 * row.true}
     if row.effectivity is None:
@@ -330,17 +330,17 @@ def draw(path: Path, rows: list[dict[str, str]]) -> None:
 
 
 def effectivities(rows: list[dict[str, str]], name: str) -> list[float]:
-    """Return the known effectivities of a part."""
+    """Return the known effectivities of a part of the budget."""
     return [float(row["effectivity"]) for row in rows if row["part"] == name and row["useful"]]
 
 
 def without() -> list[Case]:
-    """Return the cases without a value to compare estimates with."""
+    """Return the cases without reference values for error estimates."""
     return [case for case in DEMOS + CASES if case.budget]
 
 
 def main() -> int:
-    """Compute and write; 0 if every median is useful."""
+    """Compute and write the errors; return 0 if every median is between 0.3 and 3."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("--output", type=Path, default=PAGE, help="page to write")
     parser.add_argument("--page", action="store_true", help="only write the page of stored values")

@@ -1,8 +1,8 @@
 """Problems with extreme parameters: finite sliding of two deformable bodies.
 
 As in `extreme_scenes` a problem is a function of the method that returns the steps and the relative
-error. A rubber block is on another one; if not stated otherwise, the bottom of the lower one is
-fixed and the top of the upper one moved.
+error. A rubber block is on another one; if not stated otherwise, the bottom of the lower block is
+fixed, and the top of the upper block is moved.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Two:
 
     Attributes:
         u, contact, problem: Displacement, contact and problem.
-        at: Displacement of the top, sideways and down, and rotation of both ends (rad).
+        at: Lateral and downward displacement of the top, and rotation of both ends (rad).
         push: Pressure on the top.
     """
 
@@ -57,7 +57,7 @@ class Two:
         ends: str = "led",
         points: int | None = None,
     ) -> None:
-        """Create them, unloaded. Collective.
+        """Create the unloaded blocks. Collective.
 
         Args:
             method: Method of the problem.
@@ -65,8 +65,8 @@ class Two:
             mu: Friction coefficient.
             widths: Widths of the lower and upper block.
             start: Left end of the upper block.
-            n: Numbers of cells along the width.
-            rows: Number of cells over the height of each.
+            n: Numbers of cells along the widths.
+            rows: Number of cells over the height of each block.
             moduli: Young's moduli.
             own: Tag of Γc, `LOWER` or `UPPER`.
             rounded: Gap at the ends due to the curvature of the upper block.
@@ -137,7 +137,7 @@ class Two:
     def lead(
         self, sideways: float, down: float, steps: int, angle: float = 0.0, **options: Any
     ) -> list[fc.Step]:
-        """Move in equal increments to a displacement and an angle. Collective."""
+        """Move the blocks in equal increments to a displacement and an angle. Collective."""
         start, end = self.at, np.array([sideways, down, angle])
 
         def load(t: float) -> None:
@@ -152,7 +152,7 @@ class Two:
 
 
 def rotated_together(steps: int, mu: float = 0.3, angle: float = 2 * np.pi, **two: Any) -> Solve:
-    """Press and slide, then rotate both; the tractions rotate with the bodies."""
+    """Press and slide, then rotate both blocks; reference: the rotated tractions."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         both = Two(method, mu=mu, rounded=0.1, **two)
@@ -172,10 +172,10 @@ def slide_over_facets(n: int, steps: int, mu: float, wide: int = 50) -> Solve:
     long block are more than 4 heights away, which changes the force by less than 1e-4.
 
     Args:
-        n: Facets of the lower block, of length 20.
+        n: Number of facets of the lower block, whose length is 20.
         steps: Number of increments.
         mu: Friction coefficient.
-        wide: Facets of the upper block, of length 1.
+        wide: Number of facets of the upper block, whose length is 1.
     """
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
@@ -190,7 +190,10 @@ def slide_over_facets(n: int, steps: int, mu: float, wide: int = 50) -> Solve:
 
 
 def slide_off(mu: float, steps: int, **two: Any) -> Solve:
-    """Slide off the end: zero force; without friction the initial force after return."""
+    """Slide off the end of the lower block.
+
+    Reference: zero force; without friction also the initial force after return.
+    """
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         both = Two(method, mu=mu, **two)
@@ -207,7 +210,7 @@ def slide_off(mu: float, steps: int, **two: Any) -> Solve:
 
 
 def lift_off(mu: float, **two: Any) -> Solve:
-    """Press, slide and lift off: zero force, and rigid-body displacements."""
+    """Press, slide and lift off; reference: zero force, and rigid-body displacements."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         both = Two(method, mu=mu, rounded=0.1, gap=1e-3, **two)

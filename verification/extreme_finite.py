@@ -32,7 +32,7 @@ def relative(found: Any, wanted: Any) -> float:
 
 
 def _pressed(mu: float, method: str, **options: Any) -> tuple[Tool, list[fc.Step]]:
-    """Press the disc in by `DEPTH`."""
+    """Press the disc into the block by `DEPTH`."""
     law = fc.Coulomb(mu, 1e4, 1e4) if mu else fc.Frictionless(1e4)
     solver = {"petsc_options": TIGHT, "method": method}
     tool = Tool(law=law, radius=RADIUS, solver=solver, **options)
@@ -40,7 +40,7 @@ def _pressed(mu: float, method: str, **options: Any) -> tuple[Tool, list[fc.Step
 
 
 def _led(tool: Tool, end: Any, steps: int) -> list[fc.Step]:
-    """Move in equal increments to a sideways and a vertical displacement and an angle."""
+    """Move the tool in equal increments to a lateral and a vertical displacement and an angle."""
     start = np.array([tool.shift.value[0], tool.shift.value[-1], float(tool.angle.value)])
 
     def load(t: float) -> None:
@@ -131,7 +131,7 @@ def slide_over_facets(n: int, steps: int, distance: float) -> Solve:
 
 
 def rotate_drum(n: int, steps: int, angle: float) -> Solve:
-    """Rotate a drum of n facets under pressure; reference: a circular one."""
+    """Rotate a drum of n facets under pressure; reference: a circular drum."""
 
     def force(method: str, obstacle: Any) -> tuple[list[fc.Step], Array]:
         scene = rubber(n=(12, 6))
@@ -162,7 +162,10 @@ def rotate_drum(n: int, steps: int, angle: float) -> Solve:
 
 
 def slide_off(mu: float, steps: int, linear: bool = True) -> Solve:
-    """Slide a block off the end of a plate: zero force; without friction and back."""
+    """Slide a block off the end of a plate.
+
+    Reference: zero force; without friction also the initial force after return.
+    """
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         scene = rubber(n=(8, 4), linear=linear)
@@ -292,8 +295,8 @@ def solved_twice(scene: dict[str, Any], setup_class: Any, make_problem: Any) -> 
 
     Args:
         scene: The scene, without a method.
-        setup_class: Its class in `finite_scenes` or `sliding_scenes`.
-        make_problem: The function of the independent solver.
+        setup_class: Setup class of the scene, in `finite_scenes` or `sliding_scenes`.
+        make_problem: Function that creates the problem of the independent solver.
     """
 
     def solve(method: str) -> tuple[list[fc.Step], float | None]:
@@ -357,7 +360,7 @@ def close_gap(gap: float, by_force: bool = False) -> Solve:
 
 
 def indent(steps: int, down: float = 0.3, **options: Any) -> Solve:
-    """Press the disc in without friction; reference: 16 increments."""
+    """Press the disc into the block without friction; reference: 16 increments."""
 
     def force(method: str, steps: int) -> tuple[list[fc.Step], Array]:
         solver = {"petsc_options": TIGHT, "method": method}

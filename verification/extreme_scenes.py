@@ -1,8 +1,8 @@
 """Problems with extreme parameters at small displacements.
 
-Blocks on planes, discs and balls, two blocks, a cylinder on a half-plane; in one increment from the
-unloaded state, if not stated otherwise. A problem is a function of the method that returns the
-steps and the error relative to its reference.
+The models are blocks on planes, discs and balls, two blocks, and a cylinder on a half-plane, solved
+in one increment from the unloaded state if not stated otherwise. A problem is a function of the
+method that returns the steps and the error relative to its reference.
 """
 
 from __future__ import annotations
@@ -161,13 +161,13 @@ def pressed(
     history: int = 1,
     **block: Any,
 ) -> Solve:
-    """Press a block on a plane by a uniform load; ``held``: with symmetry conditions."""
+    """Press a block on a plane by a uniform load, with symmetry conditions if ``held``."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         body = Block(**block)
         h = body.size[-1] / block.get("n", (8, 8))[-1]
         k_n = kappa * body.modulus / h
-        # The load is proportional to the modulus: equal strains in all units.
+        # The load is proportional to the modulus, so that strains are equal in all units.
         p = PRESSURE * load * body.modulus / E
         bcs = body.rollers() if held else []
         problem = body.problem(friction_law(mu, k_n), body.plane(gap), bcs, method=method)
@@ -188,7 +188,7 @@ def compared(
     state: Callable[[str], tuple[list[fc.Step], Any]],
     reference: Callable[[], tuple[list[fc.Step], Any]],
 ) -> Solve:
-    """Solve by a method; compare u with the reference, which is solved once and may fail."""
+    """Return a problem that compares u with a reference, which is solved once and may fail."""
 
     @functools.cache
     def other() -> fem.Function | None:
@@ -235,7 +235,7 @@ State = tuple[fc.Step, Array]
 
 
 def block_in_units(method: str, modulus: float, length: float, n: Sequence[int]) -> State:
-    """Solve the block on the disc; return its displacements relative to its length."""
+    """Solve the block on the disc; return the step, and u divided by the length of the block."""
     body = Block(modulus=modulus, size=(length,) * len(n), n=n)
     bcs = body.moved(0.02 * length, 0.03 * length)
     problem = body.problem(fc.Coulomb(0.3), body.ball(), bcs, method=method)
@@ -324,7 +324,7 @@ def cycle(path: list[tuple[float, float]], mu: float = 0.3) -> Solve:
 
 
 def loaded(side: float, up: float, mu: float, bcs: str, n: Sequence[int] = (8, 8)) -> Solve:
-    """Load a block on a plane; the reference of the contact force is the load."""
+    """Load a block on a plane, and compare the contact force with the load."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         body = Block(n=n)
@@ -379,7 +379,7 @@ class Pair:
         n: tuple[int, int] = (6, 8),
         partitioner: Any = None,
     ) -> None:
-        """Create them; ``contrast``: ratio of moduli, ``gap``: relative to ``length``."""
+        """Create the blocks; ``contrast``: ratio of moduli, ``gap``: gap divided by ``length``."""
         self.moduli, self.length, self.gap = (modulus, contrast * modulus), length, gap * length
         lines = [
             [np.linspace(0, 1, m + 1), low + np.linspace(0, 0.5, m // 2 + 1)]
@@ -419,7 +419,7 @@ class Pair:
 
         Args:
             law: Contact law.
-            curved: Whether the gap is that of a radius of twice the width.
+            curved: Whether the gap is a parabola with a radius of twice the width.
             options: Options of `ContactProblem`.
         """
         a, x = self.length, self.body.x
@@ -431,7 +431,7 @@ class Pair:
         )
 
     def press(self) -> float:
-        """Apply symmetry conditions, and a pressure of 1e-3 of the smaller modulus; return it."""
+        """Apply symmetry conditions; apply and return a pressure of 1e-3 of the smaller modulus."""
         self.body.hold(BOTTOM, 1)
         self.body.hold(LEFT, 0)
         pressure = PRESSURE / E * min(self.moduli)
@@ -464,7 +464,7 @@ class Pair:
 
 
 def flat_pair(kappa: float, **pair: Any) -> Solve:
-    """Press one block on the other by a uniform load; k_n is relative to the softer one."""
+    """Press one block on the other by a uniform load; k_n is relative to the softer block."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         both = Pair(**pair)
@@ -490,7 +490,7 @@ def rounded_pair(kappa: float, mu: float, **pair: Any) -> Solve:
 
 
 def pair_in_units(method: str, modulus: float, length: float, _: Any) -> State:
-    """Solve the rounded blocks; return their displacements relative to the length."""
+    """Solve the rounded blocks; return the step, and u divided by the length."""
     both = Pair(modulus=modulus, length=length)
     both.drag()
     step = both.problem(fc.Coulomb(0.3), curved=True, method=method).solve()
@@ -587,7 +587,7 @@ def ranked(
 
 
 def on_one_rank(ranks: int, kind: str, kappa: float, mu: float) -> Solve:
-    """Run `ranked` on several ranks; compare with one rank."""
+    """Run `ranked` on several ranks, and compare the displacements with those on one rank."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         with tempfile.TemporaryDirectory() as folder:

@@ -6,10 +6,10 @@ python verification/extremes.py --only k_n --output /tmp/extremes.md
 python verification/extremes.py --page
 
 The problems are those of ``extreme_scenes.py``, ``extreme_finite.py`` and ``extreme_bodies.py``.
-Writes docs/extremes.csv, its page and figures; ``--only`` replaces the rows of some groups, and
-``--page`` writes page and figures of the stored rows. The exit code is 1 if a run fails: an error
-above its tolerance, a result that is not finite, or an end that is neither a verified solution nor
-an error that states a reason.
+The script writes docs/extremes.csv, its page and figures; ``--only`` replaces the rows of some
+groups, and ``--page`` writes page and figures of the stored rows. The exit code is 1 if a run
+fails: if its error exceeds the tolerance or is not finite, or if it ends with neither a verified
+solution nor an error that states a reason.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ class Row:
         outcome: "verified", or "refused: " and the error.
         attempts: Methods tried, with their iterations.
         iterations: SNES iterations of all increments.
-        error: Relative to the reference; NaN if there is no reference.
-        reference: What the result is compared with.
+        error: Error relative to the reference; NaN if there is no reference.
+        reference: Reference of the error; empty if there is none.
         tolerance: Largest error that passes.
         seconds: Wall time.
     """
@@ -101,7 +101,7 @@ class Trial:
         group, case, reference, tolerance: As in `Row`.
         solve: Returns the steps and the error, None if there is no reference.
         methods: Methods to use.
-        slow: Whether it takes more than about 20 s.
+        slow: Whether the solution takes more than about 20 s.
     """
 
     group: str
@@ -113,7 +113,7 @@ class Trial:
     slow: bool = False
 
     def run(self) -> Iterator[Row]:
-        """Solve by every method."""
+        """Solve the problem by every method, and yield the rows."""
         for method in self.methods:
             start = time.perf_counter()
             tried: tuple[Any, ...] = ()
@@ -267,7 +267,7 @@ def trials() -> Iterator[Trial]:
 
 
 def one_rank_alone() -> Iterator[Trial]:
-    """Γc on one of several ranks, in separate processes."""
+    """Yield problems with Γc on one of several ranks, in separate processes."""
     for ranks in (2, 3):
         for kind, k, mu in (("disc", 10.0, 0.3), ("two bodies", 1e5, 0.0)):
             case = f"{ranks} ranks, {kind}, k_n h/E = {k:g}, μ = {mu:g}"
@@ -277,12 +277,12 @@ def one_rank_alone() -> Iterator[Trial]:
                 on_one_rank(ranks, kind, k, mu),
                 "one rank",
                 1e-5,
-                METHODS if kind == "disc" else ("newton",),  # L-BFGS takes hundreds of iterations
+                METHODS if kind == "disc" else ("newton",),  # L-BFGS needs hundreds of iterations
             )
 
 
 def in_space() -> Iterator[Trial]:
-    """Blocks of hexahedra on a plane and on a ball."""
+    """Yield blocks of hexahedra on a plane and on a ball."""
     few, some = (2, 2, 2), (4, 4, 4)
     for k in (1e-3, 1.0, 1e3, 1e6, 1e8):
         name = "3D, block on a plane, k_n h/E"
@@ -319,7 +319,7 @@ def in_space() -> Iterator[Trial]:
 
 
 def two_bodies() -> Iterator[Trial]:
-    """Two linear elastic blocks."""
+    """Yield problems of two linear elastic blocks."""
     exact, other = "uniform compression (exact)", "method `alternating`"
     for k in (1e-3, 1.0, 1e3, 1e6, 1e8):
         yield Trial("two bodies, flat, k_n h/E", f"{k:.0e}", flat_pair(k), exact)
@@ -343,7 +343,7 @@ def two_bodies() -> Iterator[Trial]:
 
 
 def against_hertz() -> Iterator[Trial]:
-    """Rigid cylinder on a half-plane: 1 % for the mesh, plus the effect of the penalty."""
+    """Yield a rigid cylinder on a half-plane; tolerance: 1 % for the mesh, plus penalty error."""
     name = "rigid cylinder on a half-plane, peak pressure, k_n h/E"
     for k in [10.0**i for i in range(-3, 9)]:
         solve, share = hertz(k)
@@ -354,7 +354,7 @@ def against_hertz() -> Iterator[Trial]:
 
 
 def finite_kinematics() -> Iterator[Trial]:
-    """Finite kinematics: moving and rotating obstacles, linear and hyperelastic bodies."""
+    """Yield linear and hyperelastic bodies on moving and rotating obstacles, finite kinematics."""
     alone = ("newton",)
     moment, again = "friction moment at full slip (exact)", "tractions before the rotation"
     name = "finite kinematics, rotating disc, rotation and increments"
@@ -440,7 +440,7 @@ _DISSIMILAR = {
 
 
 def finite_bodies() -> Iterator[Trial]:
-    """Finite sliding of two bodies of equal and of very different mesh and modulus."""
+    """Yield finite sliding of two bodies of equal and of very different mesh and modulus."""
     alone, start = ("newton",), "two bodies, finite kinematics, "
     name, again = start + "both rotated by 360°, increments", "tractions before the rotation"
     for steps in (4, 12, 36):
@@ -479,7 +479,7 @@ def finite_bodies() -> Iterator[Trial]:
 
 
 def _columns_of_two(start: str, alone: tuple[str, ...]) -> Iterator[Trial]:
-    """Uniform compression of two columns."""
+    """Yield uniform compression of two columns."""
     name, exact = start + "rubber columns compressed to 60 %", "uniform stretch (exact)"
     fine, coarse = {"n": (1, 20)}, {"n": (20, 1)}
     for k in [10.0**i for i in range(-3, 7)]:
@@ -507,7 +507,7 @@ def _columns_of_two(start: str, alone: tuple[str, ...]) -> Iterator[Trial]:
 
 
 def _against_others(start: str, alone: tuple[str, ...]) -> Iterator[Trial]:
-    """Comparison with the independent solver, a rigid plane, and other increments."""
+    """Yield comparisons with the independent solver, a rigid plane, and other increments."""
     second = "independent solver"
     for mu in (0.0, 0.3, 1.0):
         name = start + f"block pressed, slid and rotated, μ = {mu:g}, k_n h/E"
@@ -673,7 +673,7 @@ def draw_errors(path: Path, rows: list[Row]) -> None:
 
 
 def draw_stiffness(path: Path, rows: list[Row]) -> None:
-    """Draw iterations and the peak pressure over the contact stiffness."""
+    """Draw iterations and the error of the peak pressure over the contact stiffness."""
     models = {
         "2D, disc": "block on a disc, μ = 0.3, k_n h/E",
         "3D, ball": "3D, block on a ball, μ = 0.3, k_n h/E",
@@ -723,7 +723,7 @@ def known(path: Path) -> dict[tuple[str, str, str], Row]:
 
 
 def main() -> int:
-    """Solve and write; 0 if no run is wrong."""
+    """Solve the problems and write the results; return 0 if no run has failed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="+", metavar="WORD", help="groups with one of these words")
     parser.add_argument("--output", type=Path, help="page to write, with a CSV file beside it")

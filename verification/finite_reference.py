@@ -2,9 +2,9 @@
 
 Distances and normals, moving and rotating frames, slip, rotation of the committed traction and the
 stress of rubber are closed formulas at points, in NumPy; the return map is that of
-`reference_solver`. Shared with the package are DOLFINx's assembly of the bulk and the scene.
+`reference_laws`. Only the scene and DOLFINx's assembly of the bulk are shared with the package.
 Tractions are differentiated by finite differences. Newton's method with a line search solves an
-increment in small steps, with the history of its start.
+increment in several parts, with the history at the start of the increment.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ Array = np.ndarray
 # Signed distance, (n,), and minus its gradient, (n, d), at points (n, d).
 GapFunction = Callable[[Array], tuple[Array, Array]]
 
-# Step of finite differences relative to the mesh size, below the elastic penetration.
+# Step of finite differences relative to the size of the mesh, below the elastic penetration.
 _DIFFERENCE = 1e-8
-# Numbers of parts of an increment that are tried; factors of softer springs to start from; and
-# largest number of augmentations.
+# Numbers of parts into which an increment is divided, in the order of attempts; factors of the
+# contact stiffness in its continuation; and largest number of augmentations.
 _PARTS = (4, 32)
 _SOFTER = 10.0 ** np.arange(-5, 0.1, 0.5)
 _ROUNDS = 400
@@ -56,7 +56,7 @@ _ROUNDS = 400
 
 
 def make_shape(scene: dict[str, Any], contact: dict[str, Any]) -> GapFunction:
-    """Return the gap function of an obstacle, by formulas or by brute force over its data."""
+    """Return the gap function of an obstacle, by formulas or by search over all of its data."""
     given, where = contact["obstacle"], finite_scenes.initial_geometry(scene, contact)
     kind, d = given["kind"], len(scene["bodies"][0]["size"])
     if contact["side"] == "right" or kind == "halfspace":
@@ -113,7 +113,7 @@ def _radial_gap(arm: Array, radius: float, sign: float) -> tuple[Array, Array]:
 
 
 def _spline_gap(points: Array) -> GapFunction:
-    """Return the gap function of a closed cubic spline, anticlockwise, by chord length."""
+    """Return the gap function of a closed anticlockwise cubic spline, parametrised by chords."""
     stick = np.vstack([points, points[:1]])
     knots = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(stick, axis=0), axis=1)))
     spline = scipy.interpolate.CubicSpline(knots, stick, bc_type="periodic")
@@ -152,7 +152,7 @@ def _polyhedron_gap(corners: Array) -> GapFunction:
         height = np.einsum("nmd,md->nm", x[:, None] - corners[None, :, 0], out)
         best = height.argmax(axis=1)
         distance, normal = height[n, best], -out[best]
-        # Outside: the closest facet, edge or corner.
+        # Outside, the closest facet, edge or corner is used.
         closest = x[:, None] - height[:, :, None] * out
         below = np.ones(height.shape, dtype=bool)
         arms = []
@@ -225,8 +225,8 @@ class FiniteContact(reference.ContactModel):
 
     Attributes:
         shape: Gap function of the obstacle in its first position.
-        about: A point of its axis of rotation.
-        axis: Direction of the axis in space; None in the plane.
+        about: A point on the axis of rotation.
+        axis: Direction of the axis in 3D; None in the plane.
         turns: Whether the obstacle rotates.
     """
 
@@ -319,7 +319,7 @@ class FiniteContact(reference.ContactModel):
 
 
 def _rotate_with_normal(vector: Array, before: Array, now: Array) -> Array:
-    """Rotate vectors by the smallest rotation of one normal to the other: two half turns."""
+    """Rotate vectors by the smallest rotation from one normal to the other, by two half turns."""
 
     def half_turn(v: Array, about: Array) -> Array:
         return 2 * np.sum(v * about, axis=1)[:, None] * about - v
@@ -345,9 +345,9 @@ class FiniteProblem(reference.Problem):
     """A linear or nonlinear bulk with contacts on moving and rotating obstacles.
 
     Attributes:
-        bulk: Returns, for u, internal forces (N,), tangent (N, N), and whether no cell is inverted.
+        bulk: Function of u: internal forces (N,), tangent (N, N), and whether no cell is inverted.
         before: Load of the last solution.
-        subdivisions: Numbers of parts of an increment, tried in this order.
+        subdivisions: Numbers of parts of an increment, in the order of attempts.
     """
 
     bulk: Any = None
@@ -375,7 +375,7 @@ class FiniteProblem(reference.Problem):
     def solve(
         self, u: Array, motion: Array, load: Any, old: list[Any], *, rtol: float = 1e-12
     ) -> tuple[Array, Array, list[Any]]:
-        """Solve one increment in parts; arguments are those of `reference.Problem.solve`."""
+        """Solve one increment in parts, with the arguments of `reference.Problem.solve`."""
         for n_parts in self.subdivisions:
             with contextlib.suppress(Failed, np.linalg.LinAlgError):
                 v, m = u, motion
@@ -420,7 +420,7 @@ class FiniteProblem(reference.Problem):
         return u, motion
 
     def _interpolate_load(self, load: Any, share: float) -> Any:
-        """Return a load between the last one and this one."""
+        """Return the load at a fraction ``share`` of the increment, by linear interpolation."""
         if share == 1.0:
             return load
         first = self.before
@@ -482,7 +482,7 @@ class FiniteProblem(reference.Problem):
                 best = (norm, u.copy(), motion.copy(), size, roundoff)
             if norm <= rtol * size or norm <= 1e-15 * roundoff:
                 break
-            if idle > 4 and best[0] <= 1e-13 * roundoff:  # round-off
+            if idle > 4 and best[0] <= 1e-13 * roundoff:  # only round-off remains
                 break
             matrix = tangent(u, motion, stick=False)
             scale = np.sqrt(np.abs(np.diag(tangent(u, motion, stick=True))))
@@ -502,14 +502,14 @@ class FiniteProblem(reference.Problem):
                 if valid:
                     chosen = (v, m, now)
                 if not is_constrained:
-                    # The body is unconstrained: search a zero of the force along the step.
+                    # The body is unconstrained: find a zero of the force along the step.
                     along, slope = now[0] @ step, residual @ step
                     if valid and abs(along) <= 0.3 * abs(slope):
                         break
                     low, high = (share, high) if valid and along < 0 else (low, share)
                     share = 2 * share if high == np.inf else 0.5 * (low + high)
                     continue
-                # Leaves a cycle.
+                # Every ninth iteration accepts a larger residual, to leave a cycle.
                 free_pass = iteration % 9 == 8 and share < 0.5
                 if valid and (
                     free_pass or np.linalg.norm(now[0] / scale) < (1 - 0.1 * share) * first
@@ -527,7 +527,7 @@ class FiniteProblem(reference.Problem):
     def _tangent(
         self, v: Array, m: Array, load: Any, old: list[Any], free_dofs: Array, *, stick: bool
     ) -> Array:
-        """Return the tangent of the free unknowns; ``stick``: with all points sticking."""
+        """Return the tangent of the free unknowns, with all points sticking if ``stick``."""
         d, free = self.body.d, self.free_motions()
         reach = _DIFFERENCE * np.ptp(self.body.nodes_x, axis=0).max()
         matrix = np.zeros((len(free_dofs) + len(free),) * 2)
@@ -578,7 +578,7 @@ def rubber_work(u: Any, v: Any, E: Any, nu: Any) -> Any:
 def make_problem(
     scene: dict[str, Any],
 ) -> tuple[FiniteProblem, Any, Callable[[int, float], FiniteLoad]]:
-    """Return the independent problem, the setup, and a function of the loads. On one rank."""
+    """Return the independent problem, the setup, and the load function, on one rank."""
     setup = finite_scenes.FiniteSetup(scene, MPI.COMM_SELF, bulk=rubber_work)
     body, surface = fuzz_reference.make_body(setup)
     contacts = []
@@ -616,7 +616,7 @@ def make_bulk(setup: Any, body: Body) -> Callable[[Array], tuple[Array, Array, b
             return body.stiffness @ u, body.stiffness, True
         key = u.tobytes()
         if key not in memory:
-            # The loads in F are removed.
+            # F contains the loads, which are removed from the internal forces.
             setup.u.x.array[:] = u
             force = fem.assemble_vector(inner).array + fem.assemble_vector(outside).array
             stiff = fem.assemble_matrix(outer).to_scipy().toarray()
@@ -646,14 +646,14 @@ def make_loads(setup: Any) -> Callable[[int, float], FiniteLoad]:
     return load
 
 
-# ---- the judge -----------------------------------------------------------------------------------
+# ---- comparison ----------------------------------------------------------------------------------
 
 
 class FiniteJudge(fuzz_judge.Judge):
-    """Compares the package's increments with finite kinematics.
+    """Compares increments of the package with the independent solver, with finite kinematics.
 
     Energies are not compared. With friction, rubber or curved obstacles an increment may have
-    several solutions: one that differs from the independent history is "another".
+    several solutions: a difference from the independent history is then "another", not "wrong".
     """
 
     @staticmethod
@@ -679,7 +679,7 @@ class FiniteJudge(fuzz_judge.Judge):
         return FiniteState(old.jump, traction, record["lambda_n"][row], None, normal)
 
     def _flatness(self, given: dict[str, Any]) -> float:
-        """Return the deviation from planes; a round obstacle has L²/(8 R) within a facet."""
+        """Return the deviation from planes; that of a round obstacle is L²/(8 R) within a facet."""
         bulges = super()._flatness(given)
         if given["obstacle"]["kind"] in ("body", "rod"):
             return bulges

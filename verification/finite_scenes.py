@@ -1,7 +1,7 @@
 """Random scenes with finite kinematics: one body on moving and rotating rigid obstacles.
 
 A scene is a dictionary as in `fuzz_scenes`, with ``"kinematics": "finite"``. Contacts are at the
-bottom and the right of the body; stages also have the angle of the obstacle below ("turn").
+bottom and the right of the body; stages also have the angle of the lower obstacle ("turn").
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def draw(
         if chance(0.35, "motion"):
             obstacle["moving"], obstacle["free"] = "force", [d - 1]
     elif chance(0.3):
-        obstacle["moving"] = "displacement"  # sideways, while the body is pressed
+        obstacle["moving"] = "displacement"  # lateral, while the body is pressed
     contacts = [contact("bottom", obstacle)]
     if chance(0.1, "corner") and drive != "force":
         contacts.append(contact("right", {"kind": "halfspace", "clearance": 0.3 * strain}))
@@ -301,13 +301,13 @@ class FiniteSetup(SceneSetup):
     """Mesh, forms, conditions and constants of a scene.
 
     Attributes:
-        angle: Angle of the obstacle below (radians).
+        angle: Angle of the lower obstacle (radians).
     """
 
     LEVELS = (*SceneSetup.LEVELS, "turn")
 
     def __init__(self, scene: Scene, comm: MPI.Comm, *, bulk: Any = None) -> None:
-        """Create it. Collective.
+        """Create mesh, forms, conditions and constants. Collective.
 
         Args:
             scene: The scene.
@@ -335,7 +335,7 @@ class FiniteSetup(SceneSetup):
         return self.bulk(E, dx) if self._rubber else super().bulk_of_energy(E, dx)
 
     def apply(self, stage: int, t: float) -> None:
-        """Set all loads."""
+        """Set all loads for a stage and a load parameter."""
         scene, d = self.scene, self.d
         self.set_friction(stage)
         now, size = self.load_levels(stage, t), np.array(scene["bodies"][0]["size"])
@@ -374,7 +374,7 @@ class FiniteSetup(SceneSetup):
         self.apply_features(stage, t)
 
     def turn(self, contact: Scene) -> tuple[Array, Array | None] | None:
-        """Return a point and the direction of the axis of rotation; None if there is none."""
+        """Return a point on the axis of rotation and its direction, or None without rotation."""
         given = contact["obstacle"]
         if "turn" not in given:
             return None
@@ -390,7 +390,7 @@ class FiniteSetup(SceneSetup):
         return about, axis
 
     def obstacle(self, contact: Scene) -> Any:
-        """Return the obstacle."""
+        """Return the obstacle of a contact."""
         given, where, d = contact["obstacle"], initial_geometry(self.scene, contact), self.d
         move: dict[str, Any] = {}
         if given.get("moving") == "displacement":
@@ -426,7 +426,7 @@ class FiniteSetup(SceneSetup):
             return fc.RigidSurface(points, numbers, **move)
         if d == 2:
             return fc.RigidProfile(points, closed=True, **move)
-        if kind == "profile":  # seen against y, x runs to the left
+        if kind == "profile":  # viewed along -y, where x points to the left
             return fc.RigidProfile(points[::-1], closed=True, extruded=(0.0, 1.0, 0.0), **move)
         return fc.RigidProfile(points, turned=(where["center"].tolist(), (0.0, 0.0, 1.0)), **move)
 

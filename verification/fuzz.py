@@ -1,4 +1,4 @@
-"""Random scenes, compared with an independent solver, to find undetected wrong results.
+"""Solves random scenes and compares them with an independent solver, to detect wrong results.
 
     docker/run python verification/fuzz.py --seed 17                  # one scene
     docker/run python verification/fuzz.py --scenes 1000 --resume results.csv
@@ -13,8 +13,8 @@
 
 Outcomes: "right"; "another" (a solution other than the independent one, which friction permits);
 "refused" (with class and category of the error); "wrong" (accepted, but not a solution); "crashed"
-(an unexpected error); "slow" (time limit); "unjudged" (the independent solver failed). Each method
-of the package is tried alone on a refused scene.
+(an unexpected error); "slow" (time limit); "unjudged" (the independent solver failed). A refused
+scene is solved again with each method of the package alone.
 
 Batches of scenes are solved in separate processes, with `mpirun` for several ranks. A scene that
 hangs or ends its process is recorded, and the next process continues after it.
@@ -51,9 +51,9 @@ Scene = dict[str, Any]
 
 OUTCOMES = ("right", "another", "refused", "wrong", "crashed", "slow", "unjudged")
 FIELDS = ("seed", "ranks", "outcome", "kind", "increments", "seconds", "features", "detail", "by")
-# Methods that are tried alone on refused scenes, and their largest number of iterations.
+# Methods with which refused scenes are solved again, and their largest number of iterations.
 METHODS = {"newton": 100, "continuation": 100, "primal_dual": 100, "lbfgs": 1000}
-# Categories of refusals by words of their texts.
+# Categories of refusals by words in the error text.
 CATEGORIES = {
     "half of the radius": "too deep",
     "gone through Γc": "gone through",
@@ -68,11 +68,11 @@ CATEGORIES = {
     "too large": "too large",
     "rigid": "rigid motion",
 }
-# Not empty if the time limit was exceeded, which may surface as another error.
+# Not empty if the time limit was exceeded, even if a library raises another error then.
 _TIMED_OUT: list[bool] = []
-# Checks of results, in contrast to those of the equations.
+# Checks of derived results, not of the equations.
 _DERIVED_RESULTS = ("reported", "energy springs", "energy dissipation", "multipliers")
-# Packages that compile forms, whose time does not count.
+# Packages that compile forms, which the time limit does not interrupt.
 _COMPILERS = ("ffcx", "cffi", "ufl")
 # Number of scenes in one process.
 _BATCH_SIZE = 120
@@ -84,12 +84,12 @@ class Outcome:
 
     Attributes:
         outcome: One of `OUTCOMES`.
-        kind: Class and category of a refusal, or the failed checks.
+        kind: Class and category of the error, or the failed checks.
         increments: Number of increments that were solved and compared.
         seconds: Time of both solvers.
         detail: Texts of errors and failed checks.
-        worst: Largest ratio of error to tolerance of every check.
-        by: Method that alone solves a refused scene.
+        worst: By check, the largest ratio of error to tolerance.
+        by: Method that solves a refused scene alone.
     """
 
     outcome: str
@@ -110,7 +110,7 @@ class _TimeLimitExceeded(BaseException):
 
 @contextlib.contextmanager
 def _time_limit(seconds: float | None) -> Iterator[None]:
-    """Raise `_TimeLimitExceeded` after some processor time without compilation, on one rank."""
+    """Raise `_TimeLimitExceeded` after some processor time, but not during a compilation."""
     if not seconds:
         yield
         return
@@ -119,7 +119,7 @@ def _time_limit(seconds: float | None) -> Iterator[None]:
         if any(
             f"/{name}/" in s.filename for s in traceback.extract_stack(frame) for name in _COMPILERS
         ):
-            # An incomplete form in the cache would block later ones.
+            # An interrupted compilation would block later ones by an incomplete form in the cache.
             signal.setitimer(signal.ITIMER_PROF, 0.5)
             return
         _TIMED_OUT.append(True)
@@ -161,14 +161,14 @@ def run_scene(
     modify: Any = None,
     perturb: Callable[[dict[str, Any]], None] | None = None,
 ) -> Outcome:
-    """Solve a scene by the package and compare it; rank 0 has the outcome. Collective.
+    """Solve a scene with the package; on rank 0 compare it and return the outcome. Collective.
 
     Args:
         scene: The scene.
         comm: Communicator; by default of one rank.
-        limit: Processor seconds for the package, on one rank.
+        limit: Processor time for the package (s); without effect on several ranks.
         modify: Function that introduces an error, see `fuzz_setup.run_history`.
-        perturb: Changes a record before it is compared (tests).
+        perturb: Function that changes a record before its comparison (tests).
     """
     from mpi4py import MPI
 
@@ -188,7 +188,7 @@ def run_scene(
     start, outcome, kind, detail = time.perf_counter(), "right", "", []
     try:
         with warnings.catch_warnings(), _time_limit(limit if comm.size == 1 else None):
-            if comm.size == 1:  # on several ranks it would be a deadlock
+            if comm.size == 1:  # on several ranks an error would be a deadlock
                 warnings.simplefilter("error", RuntimeWarning)
             fuzz_setup.run_history(scene, comm, records.append, modify, setup_class)
     except _TimeLimitExceeded:
@@ -245,14 +245,14 @@ def run_scene(
 
 
 def find_solving_method(scene: Scene, comm: Any = None, *, limit: float | None = None) -> str:
-    """Return the first method that alone solves a refused scene, or "". Collective.
+    """Return the first method that solves a refused scene alone, or "". Collective.
 
     Args:
         scene: The scene.
         comm: Communicator; by default of one rank.
-        limit: Processor seconds, as for `run_scene`.
+        limit: Processor time (s), as for `run_scene`.
     """
-    for method, most in METHODS.items():  # an iteration limit excludes a fallback
+    for method, most in METHODS.items():  # an iteration limit excludes the fallback
         found = run_scene(scene | {"method": method, "max_iterations": most}, comm, limit=limit)
         outcome = found.outcome if comm is None else comm.bcast(found.outcome)
         if outcome in ("right", "another"):
@@ -261,7 +261,7 @@ def find_solving_method(scene: Scene, comm: Any = None, *, limit: float | None =
 
 
 def _next_load(scene: Scene, records: list[dict[str, Any]]) -> tuple[int, float] | None:
-    """Return stage and load parameter of the next increment."""
+    """Return stage and load parameter of the next increment, or None after the last one."""
     from verification import fuzz_scenes
 
     last = (records[-1]["stage"], records[-1]["load"]) if records else (-1, 0.0)
@@ -307,7 +307,7 @@ def list_features(scene: Scene) -> list[str]:
 
 
 def _dissimilarities(scene: Scene) -> list[str]:
-    """Return how Γc differs, by a factor of 4 in the facet size or of 1000 in the modulus."""
+    """Return the features of a Γc whose facet size differs by a factor of 4, or modulus by 1000."""
     own, other = (
         scene["bodies"][side["body"]]
         for side in (scene["contacts"][0], scene["contacts"][0]["obstacle"])
@@ -329,7 +329,7 @@ def _draw_scene(seed: int, arguments: argparse.Namespace, ranks: int) -> Scene:
     options = {"without": tuple(arguments.without), "ranks": ranks, "family": family}
     if arguments.mixed:
         number, scene = seed if family is None else family, fuzz_scenes.draw
-        # Expensive features occur in some of the families.
+        # Expensive features are limited to some of the families.
         rare = {"space": number % 8 in (0, 5), "multipliers": number % 3 == 0}
         rare |= {"method": number % 2 == 0, "fine": False}
         if number % 8 in (2, 5) and seed % 2 == 0:
@@ -345,7 +345,7 @@ def _draw_scene(seed: int, arguments: argparse.Namespace, ranks: int) -> Scene:
 
 
 def _cache_forms() -> dict[Any, Any]:
-    """Load compiled forms once per process, because FFCx lists its whole cache folder each time.
+    """Make FFCx load a form once per process, because it lists its whole cache folder each time.
 
     Returns:
         The loaded forms by name.
@@ -368,7 +368,7 @@ def _cache_forms() -> dict[Any, Any]:
 
 
 def _run_batch(seeds: list[int], arguments: argparse.Namespace) -> None:
-    """Run scenes in this process, and print a line for each on rank 0. Collective."""
+    """Run scenes in this process, and print each outcome as JSON on rank 0. Collective."""
     import gc
 
     from mpi4py import MPI
@@ -384,7 +384,7 @@ def _run_batch(seeds: list[int], arguments: argparse.Namespace) -> None:
         loaded = len(forms)
         outcome = run_scene(scene, comm if comm.size > 1 else None, limit=arguments.limit)
         if outcome.outcome == "slow" and comm.size == 1 and len(forms) > loaded:
-            # Again with compiled forms.
+            # Solved again, with compiled forms.
             outcome = run_scene(scene, None, limit=arguments.limit)
         refused = comm.bcast(outcome.outcome == "refused" and "NotConverged" in outcome.kind)
         if refused and "max_iterations" not in scene:
@@ -397,7 +397,7 @@ def _run_batch(seeds: list[int], arguments: argparse.Namespace) -> None:
 
 
 def _start_batch(seeds: list[int], arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """Yield results of scenes solved in one process, until it ends or hangs."""
+    """Yield the outcomes of scenes solved in one process, until it ends or hangs."""
     log = ["--work", ",".join(map(str, seeds)), "--limit", arguments.limit]
     log += ["--alike", arguments.alike] + ["--finite"] * arguments.finite
     log += ["--bodies"] * arguments.bodies + ["--extreme"] * arguments.extreme
@@ -452,7 +452,7 @@ def _start_batch(seeds: list[int], arguments: argparse.Namespace) -> Iterator[di
 
 
 def run_campaign(arguments: argparse.Namespace) -> Counter[str]:
-    """Run the scenes that are not in the file of results yet, and append them."""
+    """Run the scenes that are not yet in the file of results, and append their outcomes."""
     path = Path(arguments.resume)
     done = set()
     if path.exists():
@@ -511,7 +511,7 @@ def run_campaign(arguments: argparse.Namespace) -> Counter[str]:
 
 
 def _simplifications(scene: Scene) -> Iterator[Scene]:
-    """Yield scenes with one feature less."""
+    """Yield simpler scenes, with one change each."""
 
     def modify(change: Callable[[Scene], Any]) -> Iterator[Scene]:
         other = copy.deepcopy(scene)
@@ -607,7 +607,7 @@ def _simplifications(scene: Scene) -> Iterator[Scene]:
 def minimise(
     scene: Scene, fails: Callable[[Scene], bool], *, seconds: float = 120.0, log: Any = None
 ) -> Scene:
-    """Remove features of a scene one by one, as long as ``fails`` is true."""
+    """Return a scene simplified step by step while ``fails`` remains true."""
     end = time.monotonic() + seconds
     going = True
     while going:
@@ -631,12 +631,12 @@ def minimise(
 
 
 def _method_remark(row: dict[str, str]) -> str:
-    """Return a remark on the method that alone solves a refused scene; older files have none."""
+    """Return a remark on the method that solves a refused scene alone; empty in older files."""
     return f", though {row['by']} alone solves it" if row.get("by") else ""
 
 
 def make_table(paths: list[str]) -> str:
-    """Return outcomes by feature, and refusals by category, in Markdown."""
+    """Return the outcomes by feature, and those not right by category, in Markdown."""
     rows = []
     for path in paths:
         with open(path, newline="") as file:

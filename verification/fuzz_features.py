@@ -1,9 +1,9 @@
-"""Additional features of random scenes, drawn by a generator of their own.
+"""Additional features of random scenes, drawn by a separate random generator.
 
-- ``"unrelated_body"``: a body in the same mesh with its own loads, motions and floor, which the
-  independent solver leaves out.
-- an obstacle of kind ``"rod"``: a plate, blade or pin (a capsule) that is thinner than a facet, and
-  is pressed against the body, slid past an end, or moved through it.
+- ``"unrelated_body"``: a body in the same mesh with its own loads, motions and floor; the
+  independent solver omits it.
+- an obstacle of kind ``"rod"``: a plate, blade or pin (a capsule) thinner than a facet, which is
+  pressed against the body, slid past an end, or moved through the body.
 - ``"translation"``: a translation of all bodies and obstacles by many lengths.
 - sliding past the end of the opposing surface.
 """
@@ -21,8 +21,8 @@ __all__ = ["UNRELATED_BODIES", "add_features", "feature_names", "with_unrelated_
 
 # Position of unrelated bodies along x, in units of length.
 _DISTANCE = 30.0
-# Unrelated bodies: E relative to the scene, motion of the top (length) or its traction relative to
-# E, and whether the bottom is on a floor with friction.
+# Unrelated bodies: E relative to the scene, displacement of the top (length) or its traction
+# divided by E, and whether the bottom is on a floor with friction.
 UNRELATED_BODIES: dict[str, Scene] = {
     "moved": {"E": 1.0, "moved": [3.0, 0.0], "floor": False},
     "rubbed": {"E": 1.0, "moved": [3.0, -1e-2], "floor": True},
@@ -64,17 +64,17 @@ def add_features(scene: Scene, seed: int, without: tuple[str, ...] = ()) -> Scen
 
 
 def _can_be_translated(scene: Scene) -> bool:
-    """Whether conditions and obstacles can move with all bodies."""
+    """Whether Dirichlet conditions and obstacles can translate together with all bodies."""
     obstacles = [c["obstacle"] for c in scene["contacts"]]
     moving = [s.get("moving") for s in obstacles]
     if "kinematics" not in scene and {s["kind"] for s in obstacles} - {"halfspace", "body"}:
-        return False  # normals of a moved curved obstacle change
+        return False  # normals of a translated curved obstacle change
     bodies = {h[0] for h in scene["dirichlet"] if 0 in h[2]}
     return "force" not in moving and len(bodies) == len(scene["bodies"])
 
 
 def _extend_sliding(scene: Scene, within: Any) -> None:
-    """Extend sliding to at most 2.5 widths of the body, on obstacles with ends."""
+    """Scale the sliding on obstacles with ends to between 0.5 and 2.5 widths of the body."""
     ends = {c["obstacle"]["kind"] for c in scene["contacts"]} & {"body", "box", "facets", "capsule"}
     sides = [abs(s["side"]) for s in scene["stages"]]
     if "kinematics" not in scene or not ends or not max(sides):
@@ -85,7 +85,7 @@ def _extend_sliding(scene: Scene, within: Any) -> None:
 
 
 def _add_rod(scene: Scene, chance: Any, pick: Any, log: Any, within: Any) -> None:
-    """Replace the obstacles by a moving rod."""
+    """Reduce the scene to one body, with a moving rod as its obstacle."""
     finite = "kinematics" in scene
     body = scene["bodies"][0]
     d, width, height = len(body["size"]), body["size"][0], body["size"][-1]
@@ -121,7 +121,7 @@ def _add_rod(scene: Scene, chance: Any, pick: Any, log: Any, within: Any) -> Non
         [(press, 0.0), (0.0, aside), (press, 0.0)],
         [(press, aside)],
     )
-    if chance(0.2):  # it comes from the side
+    if chance(0.2):  # the rod approaches from the side
         sign = pick(-1.0, 1.0)
         obstacle["at"] = float(f"{0.5 - sign * (0.55 + 0.5 * (reach - width) / width):.4g}")
         obstacle["clearance"] = -depth

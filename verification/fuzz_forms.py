@@ -1,7 +1,7 @@
 """Equivalent bulk forms of random scenes.
 
-Each equals the form with piecewise constant coefficients (`SceneSetup.F`), which the independent
-solver uses. Cells are tagged by body and half of the body.
+Each form is equal to that with piecewise constant coefficients (`SceneSetup.F`), which the
+independent solver uses. Cells are tagged by body and by its lower or upper half.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Comparison of the package's increments with the independent solver (`reference_solver`).
 
-Two histories are followed. One evaluates equations, laws and results at the displacements of the
-package, which holds however many solutions there are. The other is solved independently. If it
-differs, the result is wrong if the laws permit one solution only, else "another" solution.
+The comparison uses two histories. The first evaluates equations, laws and results at the
+displacements of the package, and does not require a unique solution. The second is solved
+independently: a difference from it is an error if the laws permit one solution only, otherwise
+"another" solution.
 """
 
 from __future__ import annotations
@@ -21,17 +22,17 @@ __all__ = ["MAX_PENETRATION", "Judge", "sample_surface"]
 
 Array = np.ndarray
 
-# Residual relative to the solver's tolerance. SNES stops below 1, the verdict accepts 2; norms here
-# are of single bodies.
+# Residual relative to the solver's tolerance. SNES stops below 1, the verdict accepts 2; here
+# norms are those of single bodies.
 _RESIDUAL = 30.0
 # Round-off of a displacement increment, relative to the previous displacement.
 _STEPPED = 16 * np.finfo(float).eps
 # Round-off of K u.
 _ROUNDING = 1000 * np.finfo(float).eps
-# Relative difference of sums over the points for the same u.
+# Relative difference of sums over the quadrature points for the same u.
 _SUMS = 1e-9
-# Relative difference of integrals between curved facets, by the square of their slope. Measured: 3
-# for bodies bent by 2e-6 to 2e-4.
+# Relative difference of integrals between curved facets, divided by the square of their slope.
+# Measured: 3 for bodies bent by 2e-6 to 2e-4.
 _CURVED = 5.0
 # Relative difference of the smoothed E/h on distorted quadrilaterals with rational integrands.
 # Measured: 1.4e-8 of the pressure.
@@ -40,27 +41,27 @@ _SMOOTHED, _K = 1e-7, ("k_n", "k_t")
 _PENETRATION = 1e-2
 # Error of initial positioning relative to the size of the bodies, and its round-off.
 _POSITION, _ROUND_OFF = 1e-6, 1e-13
-# Penetration between points beyond that at the points, relative to the facet length. The package
-# accepts 15 % if tangent planes explain it, and 2 % for the quadrature.
+# Penetration between quadrature points minus that at the points, relative to the facet length. The
+# package accepts 15 % if tangent planes explain it, and 2 % for the quadrature.
 MAX_PENETRATION = 0.2
-# Change of the contact force with geometry at the deformed positions; the package refuses a
-# first-order estimate above 20 %.
+# Relative change of the contact force with geometry at the deformed positions; the package refuses
+# a first-order estimate above 20 %.
 _GEOMETRY_CHANGE, _REFUSED_CHANGE = 0.5, 0.2
 # Distance relative to the mesh size beyond which a solution is on another branch.
 _OTHER_BRANCH = 0.1
 # Depth of a narrow rod between points, relative to the facet length: the package accepts 5 % and
 # 2 % for the quadrature.
 _ROD_DEPTH = 0.07
-# Number of parts of an increment in which a rod is followed.
+# Number of parts of an increment in which the path of a rod is evaluated.
 _PARTS = 64
 # Relative difference of forces from the nearest exact solution, and from the independent history;
-# and the latter if friction multipliers are not unique at the edge of Γc.
+# and from the latter if friction multipliers are not unique at the edge of Γc.
 _NEAREST, _INDEPENDENT = 1e-5, 1e-4
 _AT_EDGE = 1e-2
 
 
 def sample_surface(surface: Any, u: Array, n: int = 9) -> tuple[Array, Array, Array]:
-    """Return points of a surface: deformed and undeformed positions, and their facets."""
+    """Return deformed and undeformed positions of points on a surface, and their facets."""
     grid = np.linspace(0, 1, n if surface.d == 2 else 5)
     at = np.stack([g.ravel() for g in np.meshgrid(*[grid] * (surface.d - 1))], axis=1)
     if surface.simplex:
@@ -71,13 +72,13 @@ def sample_surface(surface: Any, u: Array, n: int = 9) -> tuple[Array, Array, Ar
 
 
 class Judge:
-    """Compares the package's increments, one by one.
+    """Compares the package's increments with the independent solver, one by one.
 
     Attributes:
         wrong: Descriptions of failed checks.
-        another: Differences from the independent history that the laws permit.
-        unjudged: Increments that the independent solver has not solved.
-        worst: Largest ratio of error to tolerance of every check.
+        another: Differences that the laws permit, because the solution is not unique.
+        unjudged: Increments and checks in which the independent solver has failed.
+        worst: By check, the largest ratio of error to tolerance.
     """
 
     def __init__(self, scene: dict[str, Any]) -> None:
@@ -87,7 +88,7 @@ class Judge:
         self.another: list[str] = []
         self.unjudged: list[str] = []
         self.worst: dict[str, float] = {}
-        # The accuracy of integrals between curved facets is that of the square of their slope.
+        # The error of integrals between curved facets is proportional to the square of their slope.
         paired = any(c["obstacle"]["kind"] == "body" for c in scene["contacts"])
         slope = 4 * sum(map(abs, scene.get("bend", [0.0])))
         self._integration_error = _CURVED * slope**2 if paired else 0.0
@@ -99,7 +100,7 @@ class Judge:
         self.problem, setup, self._load = self._make_problem(scene)
         self._curvature_height = sum(map(abs, scene.get("bend", []))) * setup.length
         self._translation = setup.length * float(np.abs(scene.get("translation", [0.0])).max())
-        self._earlier_overlap: dict[int, float] = {}  # largest by contact
+        self._earlier_overlap: dict[int, float] = {}  # largest one by contact
         self._other = self._make_problem(scene)[0]
         self.problem.largest_translation = self._other.largest_translation = self._translation
         self._moduli = setup.moduli
@@ -120,7 +121,7 @@ class Judge:
     # ---- increments ------------------------------------------------------------------------------
 
     def check_increment(self, record: dict[str, Any]) -> None:
-        """Compare one committed increment."""
+        """Check one committed increment."""
         name = f"stage {record['stage']} at {record['load']:.4g}"
         problem, load = self.problem, self._load(record["stage"], record["load"])
         self._change_friction(record["stage"])
@@ -158,7 +159,7 @@ class Judge:
             c.next_state(f, o) for c, f, o in zip(problem.contacts, found, old, strict=True)
         ]
         now |= {"u": u, "motion": motion, "load": load, "found": found}
-        # Evaluated before points lose their pairs and the energy of their springs.
+        # Before the update of pairs, in which points may lose the energy of their springs.
         now["springs"] = sum(
             c.stored_energy(f) for c, f in zip(problem.contacts, found, strict=True)
         )
@@ -166,11 +167,11 @@ class Judge:
         self._before, self._u, self._motion = now, u, motion
 
     def try_next_load(self, stage: int, t: float) -> str:
-        """Solve the next increment by the independent solver alone.
+        """Solve the next increment with the independent solver only.
 
         Returns:
-            "not solved apart", "solved apart", or "rightly" with the geometrical checks that fail,
-            so that a refusal is justified.
+            "not solved apart"; "solved apart"; or "rightly" with the geometrical checks that the
+            solution fails, which justify a refusal.
         """
         load = self._load(stage, t)
         self._change_friction(stage)
@@ -219,18 +220,18 @@ class Judge:
         return rows[row, d + 1 :].ravel().copy()
 
     def _check_slip_resets(self, name: str, record: dict[str, Any], load: Any) -> None:
-        """Move the slip reference to where the package has moved it, and check this state.
+        """Set the slip reference at the state recorded by the package, and check the state.
 
-        In it the first contact of coupled bodies just touches; bodies that were positioned have
-        moved rigidly, without deeper penetration; and the points whose reference moves were
-        unloaded.
+        At first touch the largest overclosure of coupled bodies is zero. Positioned bodies have
+        moved rigidly, into contact, and without deeper penetration. Points with a new reference
+        were unloaded.
         """
         problem, old = self.problem, list(self._state)
-        # Bodies are positioned on obstacles in their committed positions.
+        # Bodies are positioned on obstacles at their committed positions.
         load = self._before["load"] if self._before else self._load(0, 0.0)
         size = np.ptp(problem.body.nodes_x, axis=0).max()
         before, groups = self._u, self._groups()
-        touching = np.full(len(groups), -np.inf)  # largest overclosure at first touch by group
+        touching = np.full(len(groups), -np.inf)  # by group, largest overclosure at first touch
         for i, record_i in enumerate(record["contacts"]):
             reported, model = record_i["slip_reset"], problem.contacts[i]
             if reported is None:
@@ -273,7 +274,7 @@ class Judge:
             self._check(name, "first touch", float(miss), _POSITION * size)
 
     def _groups(self) -> Array:
-        """Return the group of coupled bodies of every contact."""
+        """Return the number of the group of coupled bodies of every contact."""
         contacts, n = self.scene["contacts"], len(self.scene["bodies"])
         bodies = [(c["body"], c["obstacle"].get("body", c["body"])) for c in contacts]
         graph = scipy.sparse.coo_matrix((np.ones(len(bodies)), np.transpose(bodies)), (n, n))
@@ -283,7 +284,7 @@ class Judge:
     def _first_touch(
         self, model: Any, record: dict[str, Any], u: Array, old: Any
     ) -> dict[str, Any]:
-        """Evaluate a contact in the state of first touch, within the motion of an obstacle."""
+        """Evaluate a contact at the first touch, which may be within an obstacle's motion."""
         if hasattr(model, "evaluate_at"):
             return model.evaluate_at(u, old)
         jump = record["slip_reset"]["jump"][self._rows_of(model, record)]
@@ -321,9 +322,9 @@ class Judge:
         return reference.State(old.jump, traction, record["lambda_n"][row])
 
     def _resolve_status(self, contact: Any, found: dict, record: dict[str, Any]) -> None:
-        """Use the package's status at points that are open or closed by round-off alone.
+        """Adopt the package's τ at points whose gap is zero up to round-off.
 
-        τ of a foundation without tension jumps there, and both are solutions.
+        τ of a foundation without tension is discontinuous there, and both values are solutions.
         """
         if contact.law.kind != "foundation" or contact.law.tension:
             return
@@ -342,7 +343,7 @@ class Judge:
         return row
 
     def _forces(self, u: Array, load: Any, found: list[dict]) -> dict[str, Any]:
-        """Return residual and forces of every body and contact."""
+        """Return residual, forces and round-off of every body, and forces of every contact."""
         problem = self.problem
         total, motion = problem.residual(u, load, found)
         parts = np.repeat(problem.body.body_numbers, problem.body.d)
@@ -351,7 +352,7 @@ class Judge:
         fixed[load.fixed] = True
         moved = np.abs(u)
         if self.scene.get("bulk") == "rubber":
-            # The round-off of I + ∇u is that of 1 even for u = 0.
+            # I + ∇u has the round-off of 1 even for u = 0.
             cells = min(min(body["n"]) for body in self.scene["bodies"])
             moved = moved + np.ptp(problem.body.nodes_x, axis=0).max() / cells
         rounding = _ROUNDING * (np.abs(problem.stiffness(u)) @ moved)
@@ -390,7 +391,7 @@ class Judge:
         }
 
     def _force_size(self, now: dict[str, Any], kind: str, i: int) -> float:
-        """Return the larger force of a body or contact at both ends of the increment."""
+        """Return the larger force on a body or contact of those before and after the increment."""
         sizes = [now[kind][i]["size"]]
         if self._before is not None:
             sizes.append(self._before[kind][i]["size"])
@@ -413,7 +414,8 @@ class Judge:
         w = contact.weights
         r_n, tau = found["r_n"], found["tau"]
         size = float(w @ np.linalg.norm(found["traction"], axis=1))
-        # Between curved facets the slip has their error, and may take back what was there before.
+        # The integration error between curved facets also affects the slip, by which the committed
+        # τ may be cancelled.
         before = np.linalg.norm(found["tau_old"], axis=1)
         taken_back = self._integration_error * float(w @ before)
         rounding = self._roundoff(contact, found)
@@ -484,7 +486,7 @@ class Judge:
     def _check_multipliers(
         self, name: str, contact: Any, found: dict, record: dict, fixed: Array
     ) -> None:
-        """Check the projected penalty tractions, relative to the tractions, and the penetration."""
+        """Check the projected penalty part of the tractions, and the penetration."""
         if contact.projection is None:
             return
         row = self._rows_of(contact, record)
@@ -503,7 +505,7 @@ class Judge:
         allowed = 2 * record["tolerance"] * scale + 4 * self._roundoff(contact, found)
         self._check(name, "multipliers", left, allowed)
         if contact.law.has_normal:
-            # Points next to the obstacle spoil the projection on a facet that overhangs it.
+            # On a facet that overhangs the obstacle, points beyond its edge distort the projection.
             depth = np.minimum(contact.projection @ found["overclosure"], found["overclosure"])
             depth = np.where(found["r_n"] < 0, depth, 0.0).max()
             # Γc may be a single point.
@@ -515,7 +517,7 @@ class Judge:
             self._check(name, "multiplier penetration", depth, _PENETRATION * size + bulges)
 
     def _flatness(self, given: dict[str, Any]) -> float:
-        """Return how far facets of a contact or the opposing ones deviate from planes (length)."""
+        """Return the deviation of the facets of both surfaces of a contact from planes (length)."""
         return float(self._curvature_height / self.scene["bodies"][given["body"]]["n"][0] ** 2)
 
     def _check_overlap(self, name: str, u: Array, found: list[dict], now: dict[str, Any]) -> None:
@@ -528,8 +530,8 @@ class Judge:
             # force of this contact or of the one with exchanged sides.
             same = [j for j in range(len(found)) if self._surfaces(j) == self._surfaces(i)]
             allowed = 1e4 * max(now["contacts"][j]["normal"] for j in same)
-            # Unloaded curved surfaces overlap by part of their deviation, which few points, and
-            # the vertices of a facet, do not resolve.
+            # Unloaded curved surfaces overlap by a fraction of their deviation from each other,
+            # which few points, and the vertices of a facet, do not resolve.
             differ = 0.1 * max(
                 self._curvature_height, *(float(np.ptp(found[j]["overclosure"])) for j in same)
             )
@@ -538,8 +540,8 @@ class Judge:
                 differ += self._curvature_height
             allowed += float(contact.k_n.mean() * contact.weights.sum()) * differ
             allowed += 1e3 * sum(b["rounding"] for b in now["bodies"])
-            # With fewer points than nodes, or on an overhang, a penetration between the points
-            # may remain after unloading.
+            # With fewer points than nodes, or on an overhang, penetration between the points may
+            # remain after unloading.
             few = self.scene["contacts"][i].get("quadrature", np.inf) < 2 * self.scene["degree"]
             if few or not contact.paired.all():
                 allowed += self._earlier_overlap.get(i, 0.0)
@@ -549,7 +551,7 @@ class Judge:
     def _check_penetration(
         self, name: str, u: Array, load: Any, motion: Array, found: list[dict]
     ) -> None:
-        """Check the penetration of rigid obstacles between the points, at deformed positions."""
+        """Check the penetration of rigid obstacles between the points at deformed positions."""
         shifts = self.problem.shifts(load, motion)
         for i, (c, f, shift) in enumerate(zip(self.problem.contacts, found, shifts, strict=True)):
             if c.deformed_gap is None or not c.law.has_normal or c.law.tension:
@@ -567,9 +569,9 @@ class Judge:
                 self._check_rod_crossing(f"{name}, contact {i}", i, u, c.centreline_at(shift))
 
     def _check_rod_crossing(self, name: str, i: int, u: Array, spine: Array) -> None:
-        """Check that the centreline of a rod has not crossed Γc, over all increments.
+        """Check that the centreline of a rod has not crossed Γc in any of the increments.
 
-        Its points move on straight paths. A rod that enters through another side does not count.
+        Its points move on straight paths. Entry through another side of the body is no failure.
         Γc must be a graph over x.
         """
         contact = self.problem.contacts[i]
@@ -586,7 +588,7 @@ class Judge:
             q = start + share * (spine - start)
             height = q[:, 1] - np.interp(q[:, 0], x[:, 0], x[:, 1])
             over = (q[:, 0] > x[:, 0].min()) & (q[:, 0] < x[:, 0].max())
-            # 0: not over Γc; -1: below it; 1: through it; 2: inside, through another side.
+            # 0: not over Γc; -1: below it; 1: has crossed it; 2: has entered by another side.
             inside = np.where(state == -1, 1, np.where(state == 0, 2, state))
             state = np.where(over, np.where(height > 0, inside, -1), 0)
         self._rod_states[i] = (u, spine, state)
@@ -598,7 +600,7 @@ class Judge:
     def _check_kinematics(
         self, name: str, u: Array, motion: Array, load: Any, old: list[Any], now: dict[str, Any]
     ) -> None:
-        """Check that contact forces do not change with geometry at the deformed positions."""
+        """Check that geometry at the deformed positions changes normal forces by at most 50 %."""
         problem = self.problem
         saved = [(c.gap_function, c.interpolation, c.paired) for c in problem.contacts]
         shifts = problem.shifts(load, motion)
@@ -640,7 +642,7 @@ class Judge:
             ):
                 c.gap_function, c.interpolation, c.paired = gap_function, interpolation, paired
         for i in range(len(forces)):
-            # With exchanged sides the forces of the two contacts are not unique, but their sum.
+            # Of two contacts with exchanged sides only the sum of the forces is unique.
             same = [j for j in range(len(forces)) if self._surfaces(j) == self._surfaces(i)]
             size = max(max(self._force_size(now, "contacts", j), forces[j]["size"]) for j in same)
             error = abs(sum(forces[j]["normal"] - now["contacts"][j]["normal"] for j in same))
@@ -657,7 +659,7 @@ class Judge:
         return bool(error > 1e-9 * size or np.abs(normal - old).max() > 1e-6)
 
     def _surfaces(self, i: int) -> set[tuple[Any, Any]]:
-        """Return the two surfaces of a contact, as body and side."""
+        """Return body and side of both surfaces of a contact."""
         given = self.scene["contacts"][i]
         obstacle = given["obstacle"]
         return {(given["body"], given["side"]), (obstacle.get("body"), obstacle.get("side"))}
@@ -672,7 +674,7 @@ class Judge:
         found: list[dict],
         now: dict[str, Any],
     ) -> None:
-        """Compare work and energies of the increment."""
+        """Compare work and energies of the increment with those of the package."""
         problem, before = self.problem, self._before
         stiff = problem.body.stiffness
         displacement = u - self._u
@@ -708,7 +710,7 @@ class Judge:
             scale += np.abs(before["outside"]) @ np.abs(displacement)
         allowed = max(1e-6, 300 * record["rtol"], self._integration_error) * scale
         rounding = sum(b["rounding"] for b in now["bodies"])
-        if before is not None:  # the bodies may have been translated without strain
+        if before is not None:  # bodies may have been translated without strain
             rounding = max(rounding, sum(b["rounding"] for b in before["bodies"]))
         allowed += 10 * rounding * max(np.abs(u).max(), np.abs(self._u).max(initial=0.0))
         for c, f in zip(problem.contacts, found, strict=True):
@@ -726,7 +728,7 @@ class Judge:
             self.wrong.append(f"energy: {name}: dissipation {slid:.3g} is negative")
 
     def _tolerance(self, record: dict[str, Any], base: float) -> float:
-        """Return the tolerance of forces, given the tolerances of the problem."""
+        """Return the relative tolerance of forces, at least ``base``."""
         found = max(base, 300 * record["rtol"], self._integration_error)
         for contact in record["contacts"]:
             if contact["lambda_n"] is not None:
@@ -756,7 +758,7 @@ class Judge:
         found: list[dict],
         now: dict[str, Any],
     ) -> None:
-        """Compare forces with the exact solution of the same equations, started at u."""
+        """Compare forces with the exact solution that the independent solver finds from u."""
         try:
             near, moved = self.problem.equilibrate(u, motion, load, old, 1e-12)
         except reference.Failed as failure:
@@ -776,7 +778,7 @@ class Judge:
     def _check_independent(
         self, name: str, record: dict[str, Any], load: Any, now: dict[str, Any]
     ) -> None:
-        """Compare with the independent history."""
+        """Solve the increment of the independent history, and compare its forces."""
         if self._other_failed:
             return
         problem = self._other
@@ -816,9 +818,9 @@ class Judge:
         self._other_u, self._other_motion = u, motion
 
     def _total_force(self, forces: list[Array], i: int) -> Array:
-        """Return the force of all contacts between the same surfaces on the body of a contact.
+        """Return the force on the body of a contact by all contacts between the same surfaces.
 
-        With multipliers on both sides only the sum is unique.
+        With multipliers on both sides only their sum is unique.
         """
         total, body = np.zeros_like(forces[i]), self.scene["contacts"][i]["body"]
         for j, contact in enumerate(self.problem.contacts):
@@ -832,10 +834,10 @@ class Judge:
     def _unique_forces(
         self, problem: Any, found: list[dict], forces: list[Array], load: Any
     ) -> list[Array]:
-        """Return the force of every contact; with friction multipliers that on free dofs alone.
+        """Return the force of every contact, with friction multipliers on the free dofs only.
 
-        At sticking points of Dirichlet nodes any multiplier within the friction cone is a
-        solution, because the split between contact force and reaction is not unique.
+        At sticking Dirichlet nodes any multiplier within the friction bound is a solution, because
+        the split between contact force and reaction is not unique.
         """
         reported = []
         given = zip(problem.contacts, found, forces, self.scene["contacts"], strict=True)
@@ -850,7 +852,7 @@ class Judge:
         return reported
 
     def _pair_within(self, record: dict[str, Any]) -> None:
-        """Find pairs where the package has found them within the increment."""
+        """Find the pairs at the displacements at which the package found them in the increment."""
         for i, reported in enumerate(record["contacts"]):
             if reported["paired_at"] is not None:
                 at = self._nodal_values(reported["paired_at"])
@@ -860,14 +862,14 @@ class Judge:
     def _update_pairs(
         self, problem: Any, states: list[Any], u: Array, record: dict[str, Any]
     ) -> None:
-        """Update pairs at a committed state, and with them the slip reference."""
+        """Update pairs and slip references at a committed state."""
         for i, reported in enumerate(record["contacts"]):
             if reported["updates_pairs"]:
                 self._update_pairs_of(problem, states, i, u, u)
 
     @staticmethod
     def _update_pairs_of(problem: Any, states: list[Any], i: int, at: Array, u: Array) -> None:
-        """Update the pairs of a contact to those at a displacement; u is the committed one."""
+        """Find the pairs of a contact at displacement ``at``; u is the committed displacement."""
         contact = problem.contacts[i]
         if contact.update_pairs is None:
             return

@@ -1,4 +1,4 @@
-"""Random scenes as problems of the independent solver (`reference_solver`)."""
+"""Problems of the independent solver (`reference_solver`) for random scenes."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from verification.reference_geometry import Body, Surface
 
 __all__ = ["capsule_gap_at", "make_body", "make_contact", "make_problem"]
 
-# Sliding distance within which points at the edge keep their pairs, relative to the facet length.
+# Slip up to which points at the edge keep their opposite points, relative to the facet length.
 _EDGE_SLIDE = 0.05
 
 
 def _relative_factor(value: float | None, contact: Scene) -> float:
-    """Return the factor of E/h."""
+    """Return the factor of E/h in a relative contact stiffness."""
     if value is not None:
         return value
     accuracy = contact.get("accuracy")
@@ -35,7 +35,7 @@ def _relative_factor(value: float | None, contact: Scene) -> float:
 
 
 def make_body(setup: SceneSetup) -> tuple[Body, Callable[[int], Surface]]:
-    """Return the bodies of a scene as arrays, and its surfaces by tag. On one rank."""
+    """Return the bodies of a scene as arrays, and a function of its surfaces. On one rank."""
     scene, d, V = setup.scene, setup.d, setup.V
     tangent = ufl.derivative(setup.F, setup.u, ufl.TrialFunction(V))
     stiffness = fem.assemble_matrix(fem.form(tangent)).to_scipy().toarray()
@@ -70,7 +70,7 @@ def make_body(setup: SceneSetup) -> tuple[Body, Callable[[int], Surface]]:
 def make_problem(
     scene: Scene,
 ) -> tuple[reference.Problem, SceneSetup, Callable[[int, float], reference.Load]]:
-    """Return the independent problem, the setup, and a function of the loads. On one rank."""
+    """Return the independent problem, the setup, and a function for the loads. On one rank."""
     setup = SceneSetup(scene, MPI.COMM_SELF)
     outside = setup.external_force()
     body, surface = make_body(setup)
@@ -100,7 +100,7 @@ def make_problem(
 
 
 def _width_ratio(slave: Surface, master: Surface) -> float:
-    """Return the median width ratio of a facet of Γc and the closest opposing one."""
+    """Return the median of the width ratios of facets of Γc and their closest opposing facets."""
     arms = [s.corners() - s.corners().mean(axis=1, keepdims=True) for s in (slave, master)]
     offset = slave.corners().mean(axis=1)[:, None] - master.corners().mean(axis=1)
     closest = np.linalg.norm(offset, axis=2).argmin(axis=1)
@@ -109,17 +109,17 @@ def _width_ratio(slave: Surface, master: Surface) -> float:
         plane, opposite = (np.linalg.svd(a)[2] for a in (own, other))
         if (plane[2] @ opposite[2]) ** 2 <= 0.5:
             continue
-        # Of x in the plane of Γc |own x| / |other x|, the largest.
+        # The largest |own x| / |other x| of all x in the plane of Γc.
         right = np.linalg.qr(other @ plane[:2].T)[1]
         found.append(np.linalg.norm(own @ plane[:2].T @ np.linalg.inv(right), 2))
     return float(np.median(found)) if found else 1.0
 
 
 def _largest_length_ratio(slave: Surface, master: Surface) -> float:
-    """Return the largest length ratio of a facet of Γc and the median facet under it.
+    """Return the largest ratio of a facet length of Γc and the median of its opposite facets.
 
-    Facets under it are the closest one, and those to which it is the closest within half of its
-    length.
+    These are the closest facet, and those whose closest facet it is, farther away by at most half
+    of its length.
     """
     ours, theirs = slave.lengths(), master.lengths()
     offset = np.linalg.norm(
@@ -141,7 +141,7 @@ def make_contact(
     model_class: Any = reference.ContactModel,
     master: Surface | None = None,
 ) -> tuple[Any, tuple[Array, Array]]:
-    """Return a contact without gap, and facet and reference coordinates of its points."""
+    """Return a contact without gap function, and facet and reference coordinates of its points."""
     scene, law = setup.scene, contact["law"]
     d, degree = setup.d, scene["degree"]
     rigid = contact["obstacle"]["kind"] != "body"
@@ -154,7 +154,7 @@ def make_contact(
         augmented = fc.Accuracy.of(accuracy).enforcement == "augmented"
     scheme, rule = contact.get("scheme"), contact.get("quadrature")
     per_node = 1
-    if rule is None and rigid:  # 4 per radius of the obstacle
+    if rule is None and rigid:  # 4 points per radius of the obstacle
         around = setup.obstacle(contact).smallest_radius
         per_node = int(np.ceil(4 * float(np.median(slave.lengths())) / around - 1e-9))
     if scheme is None and rule is None and augmented and rigid and degree == 1 and per_node <= 1:
@@ -175,7 +175,7 @@ def make_contact(
     x, _ = slave.position(facet, xi)
     owner = setup.cell_body[slave.cells]
     stress, modulus = setup.moduli[owner[0]], setup.moduli[owner]
-    if master is not None:  # the softer body determines it
+    if master is not None:  # the softer body determines the stiffness
         modulus = np.minimum(modulus, setup.moduli[setup.cell_body[master.cells]].max())
 
     def stiffness(given: Any) -> Array:
@@ -235,7 +235,7 @@ def make_contact(
 
 
 def capsule_gap_at(x: Array, where: dict[str, Any]) -> tuple[Array, Array]:
-    """Return the distance of points from a capsule, (n,), and minus its gradient, (n, d)."""
+    """Return the distances of points from a capsule, (n,), and minus their gradients, (n, d)."""
     low, high = where["ends"]
     direction = high - low
     share = (x - low) @ direction / max(direction @ direction, np.finfo(float).tiny)
@@ -246,7 +246,7 @@ def capsule_gap_at(x: Array, where: dict[str, Any]) -> tuple[Array, Array]:
 
 
 def _make_contact(setup: SceneSetup, contact: Scene, slave: Surface, opposite: Any) -> Any:
-    """Return a contact of the independent solver."""
+    """Return a contact of the independent solver with its gap function and pairs."""
     master = opposite() if contact["obstacle"]["kind"] == "body" else None
     model, (facet, xi) = make_contact(setup, contact, slave, master=master)
     scene, given, x = setup.scene, contact.get("gap"), model.x
@@ -286,7 +286,7 @@ def _make_contact(setup: SceneSetup, contact: Scene, slave: Surface, opposite: A
 
         def find_current_pairs(u: Array) -> tuple[Array, Array, Array]:
             matrix, where, met = reference_geometry.find_pairs(slave, master, (facet, xi), u=u)
-            # At the edge any strain may separate a point from its pair.
+            # At the edge any strain may separate a point from its opposite point.
             slid = np.linalg.norm(model.jump(u), axis=1) > _EDGE_SLIDE * slave.lengths()[facet]
             met, lost = met | ~slid, ~met & ~slid
             rows = np.where(met[:, None], interpolation - matrix, 0.0)
@@ -298,7 +298,7 @@ def _make_contact(setup: SceneSetup, contact: Scene, slave: Surface, opposite: A
 
 
 def _gap_function(kind: str, where: dict[str, Any], x: Array) -> Any:
-    """Return a function of the obstacle's displacement: gap and normal at the points."""
+    """Return the function from an obstacle's displacement to gap and normal at the points."""
     if kind == "halfspace":
         normal = np.asarray(where["normal"])
         return lambda s: ((x - where["point"] - s) @ normal, np.tile(-normal, (len(x), 1)) + 0 * s)
@@ -322,7 +322,7 @@ def _gap_function(kind: str, where: dict[str, Any], x: Array) -> Any:
 
 
 def _l2_projection(slave: Surface, facet: Array, xi: Array, weights: Array, degree: int) -> Array:
-    """Return the L2 projection onto continuous functions on Γc, at the points."""
+    """Return the L2 projection onto continuous functions on Γc as a matrix of point values."""
     import basix
 
     kind = "interval" if slave.d == 2 else "triangle" if slave.simplex else "quadrilateral"

@@ -2,7 +2,7 @@
 
 A scene has boxes without common nodes, contacts between them or with rigid obstacles, Dirichlet
 conditions (body, side, components, kind) and stages of loads. `fuzz_setup` and `fuzz_reference`
-create its problems. Lengths and forces are scaled by ``units``. Stored scenes do not depend on
+create its problems. Lengths and forces are scaled by ``units``. Stored scenes do not change with
 `draw`.
 """
 
@@ -50,7 +50,7 @@ FORMS = (
     "measures",  # a measure per material with common tags
     "energy",  # derivative of energies over tags
     "loads",  # piecewise constant coefficients, tagged measure
-    "beside",  # an untagged measure next to that of the loads
+    "beside",  # an untagged measure of the bulk, a tagged one of the loads
 )
 TOP = 1
 NU_MAX = 0.45
@@ -72,11 +72,11 @@ def make_samplers(
     Args:
         rng: Generator of numbers.
         structure: Default generator of features and choices.
-        without: Features that are never chosen.
+        without: Features to exclude.
 
     Returns:
-        Draws of a feature by its probability and name; of one of several values; of a number
-        between two powers of ten; and of one between two numbers, to three digits.
+        Functions that draw whether a scene has a feature, by probability and name; one of several
+        values; a number between two powers of ten; and one between two numbers, to three digits.
     """
 
     def chance(p: float, feature: str = "", of: np.random.Generator = structure) -> bool:
@@ -114,8 +114,8 @@ def draw(
             "restart", "bend", "both", "narrow", "changes", "multipliers", "motion", "gap",
             "max_iterations", "space", "method", "accuracy", "form".
         ranks: Number of ranks, stored in the scene.
-        family: Scenes of one family share their structure, so that few forms are compiled; by
-            default every scene has its own.
+        family: Family of scenes with a common structure, so that few forms are compiled; by
+            default the seed determines the structure.
     """
     rng = np.random.default_rng([seed, 20])
     structure = rng if family is None else np.random.default_rng([family, 21])
@@ -300,7 +300,7 @@ def draw(
         if chance(0.5):
             moves["moving"] = "displacement"
         else:
-            moves["moving"] = "force"  # pressed by a force, moved sideways
+            moves["moving"] = "force"  # loaded by a force, with prescribed sideways motion
             moves["free"] = pick([d - 1], [d - 1], [0, d - 1])
 
     # Stages: pressure and shear at their end, in units of strain times E.
@@ -375,7 +375,7 @@ def draw(
 
 
 def _slide_far(scene: Scene, rng: np.random.Generator) -> None:
-    """Let a block that is led on another one slide over facets, here and there past its end."""
+    """Let a driven block slide by 0.02 to 0.6 of its height, across facets or past an end."""
     pairs = [c["obstacle"] for c in scene["contacts"] if c["obstacle"]["kind"] == "body"]
     small = scene["strain"] < 0.02 and "bend" not in scene
     searched = scene["degree"] == 1 and scene["cell"] != "hexahedron"
@@ -386,17 +386,17 @@ def _slide_far(scene: Scene, rng: np.random.Generator) -> None:
     for stage in scene["stages"]:
         way = np.sign(stage["side"]) * rng.uniform(0.02, 0.6) / scene["strain"]
         stage["side"] = float(f"{way:.3g}")
-        # Surfaces that come back to where they just touch bear round-off, or nothing.
+        # The contact force of surfaces that just touch would be round-off, or zero.
         stage["normal"] = stage["normal"] or -0.3
 
 
 def draw_form(seed: int, family: int | None, without: tuple[str, ...]) -> dict[str, str]:
-    """Draw the bulk form of a scene, by a generator of its own.
+    """Draw the bulk form of a scene from a separate random generator.
 
     Args:
         seed: Seed of the scene.
-        family: Family of the scene, which shares a form.
-        without: Excluded features; "form" gives the plain form.
+        family: Family of the scene, whose scenes have the same form.
+        without: Features to exclude; with "form" the form is the plain one.
     """
     rng = np.random.default_rng([seed if family is None else family, 23])
     form = FORMS[int(rng.integers(len(FORMS)))]
@@ -404,7 +404,7 @@ def draw_form(seed: int, family: int | None, without: tuple[str, ...]) -> dict[s
 
 
 def load_path(scene: Scene) -> list[tuple[int, float]]:
-    """Return the increments: stage and load parameter in (0, 1]."""
+    """Return stage and load parameter, in (0, 1], of every increment."""
     return [
         (i, (k + 1) / stage["steps"])
         for i, stage in enumerate(scene["stages"])
@@ -413,7 +413,7 @@ def load_path(scene: Scene) -> list[tuple[int, float]]:
 
 
 def frictions(scene: Scene, stage: int) -> list[float | None]:
-    """Return the friction coefficient of every contact in a stage, or None."""
+    """Return the friction coefficient of every contact in a stage; None without friction."""
     factor = scene["stages"][stage].get("friction", 1.0)
     given = [c["law"].get("friction") for c in scene["contacts"]]
     return [None if f is None else factor * f for f in given]

@@ -1,4 +1,4 @@
-"""Random scenes as problems of the package, and their solution."""
+"""Problems of the package for random scenes, and their solution."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _mesh_arrays(scene: Scene) -> tuple[Array, Array, Array]:
             grid = grid + np.where((grid > 0) & (grid < 1), move, 0.0)
         number = np.arange(len(grid)).reshape([k + 1 for k in n])
         bricks = []
-        for corner in range(2**d):  # the first coordinate runs fastest
+        for corner in range(2**d):  # the first coordinate varies fastest
             cut = tuple(slice(corner >> i & 1, n[i] + (corner >> i & 1)) for i in range(d))
             bricks.append(number[cut].ravel())
         found = np.column_stack(bricks)
@@ -63,7 +63,7 @@ def _mesh_arrays(scene: Scene) -> tuple[Array, Array, Array]:
 
 
 def _make_quadratic(cell: str, x: Array, cells: Array, boxes: Array) -> tuple[Array, Array, Array]:
-    """Return the mesh with geometry of degree 2."""
+    """Return the arrays of the mesh with geometry of degree 2."""
     element = basix.ufl.element("Lagrange", cell, 1, shape=(x.shape[1],))
     straight = dolfinx.mesh.create_mesh(MPI.COMM_SELF, cells=cells, x=x, e=ufl.Mesh(element))
     nodes = fem.functionspace(straight, ("Lagrange", 2))
@@ -81,7 +81,7 @@ _SIDES = {
 
 
 def tag_of(scene: Scene, body: int, side: str) -> int:
-    """Return the tag of a side: 11, 12, … for Γc; 21, 22, … for opposing sides; `TOP`."""
+    """Return the tag of a side: 11, … for Γc; 21, … for opposing sides; `TOP`; else above 99."""
     for i, contact in enumerate(scene["contacts"]):
         if (contact["body"], contact["side"]) == (body, side):
             return 11 + i
@@ -97,15 +97,15 @@ class SceneSetup:
 
     Attributes:
         n_scene_bodies: Number of bodies without the unrelated one, which is the last.
-        translation: Translation of all bodies and obstacles of the scene.
+        translation: Translation of all bodies and obstacles of the scene (length).
         F: The residual with piecewise constant coefficients; the package gets an equivalent form
             (`fuzz_forms.make_form`).
-        LEVELS: Names of the load factors that the stages of a scene have.
-        slip_resets: New slip references of this increment by contact: "rigid", whether bodies were
-            positioned; "u", see `_gather_displacement`; "jump" at the points, (n_points, d); and
-            "unloaded", the points that it applies to, (n_points,).
-        paired_at: By contact, where its pairs were found in this increment,
-            see `_gather_displacement`.
+        LEVELS: Names of the load factors of a stage.
+        slip_resets: By contact, the slip reference set in this increment: "rigid", whether bodies
+            were positioned; "u", as from `_gather_displacement`; "jump" at the points,
+            (n_points, d); and "unloaded", the points with this reference, (n_points,).
+        paired_at: By contact, the displacement at which its pairs were found in this increment, as
+            from `_gather_displacement`.
     """
 
     LEVELS: tuple[str, ...] = ("normal", "side", "across")
@@ -201,12 +201,12 @@ class SceneSetup:
         return fem.form(-ufl.replace(self.F, {self.u: fem.Function(self.V)}))
 
     def facets_of(self, body: int, side: str) -> Array:
-        """Return the facets of a side of a body; loaded tops share a tag."""
+        """Return the facets of a side of one body; tops without contact share a tag."""
         facets = self.tags.find(tag_of(self.scene, body, side))
         return facets[np.isin(self.cells_of(facets), np.flatnonzero(self.cell_body == body))]
 
     def _bend(self) -> None:
-        """Bend the bodies by a parabola over x."""
+        """Raise the nodes of the bodies by a parabola in x."""
         x = self.mesh.geometry.x
         on_increment = np.zeros(len(x), dtype=bool)
         for b, (body, rise) in enumerate(
@@ -244,7 +244,7 @@ class SceneSetup:
     # ---- loads -------------------------------------------------------------------------------
 
     def load_levels(self, stage: int, t: float) -> dict[str, float]:
-        """Return the load factors `LEVELS` within a stage."""
+        """Return the load factors `LEVELS` at a load parameter t in [0, 1] of a stage."""
         stages = self.scene["stages"]
         zero = dict.fromkeys(self.LEVELS, 0.0)
         before = stages[stage - 1] if stage else zero
@@ -257,7 +257,7 @@ class SceneSetup:
                 contact.parameters["friction"].value = friction
 
     def obstacle_loads(self) -> tuple[list[Array], list[Array]]:
-        """Return displacement of and force on the obstacle of every contact, (gdim,) each."""
+        """Return displacement and force of the obstacle of every contact, (gdim,) each."""
         shifts, forces = [], []
         for contact in self.scene["contacts"]:
             moving, free = contact["obstacle"].get("moving"), contact["obstacle"].get("free", ())
@@ -275,7 +275,7 @@ class SceneSetup:
         return shifts, forces
 
     def apply(self, stage: int, t: float) -> None:
-        """Set all loads."""
+        """Set loads, Dirichlet values and obstacle motions at a load parameter of a stage."""
         scene, d = self.scene, self.d
         self.set_friction(stage)
         now = self.load_levels(stage, t)
@@ -323,7 +323,7 @@ class SceneSetup:
         self.shift.value[:] += self.translation.value
         if "unrelated_body" not in scene:
             return
-        # A function of the position on the load path.
+        # Its load is a function of the position on the load path.
         unrelated = fuzz_features.UNRELATED_BODIES[scene["unrelated_body"]]
         share = abs(np.sin(1.3 * (stage + t)))
         direction, load = np.zeros(d), np.zeros(d)
@@ -463,7 +463,7 @@ class SceneSetup:
 
 
 def capsule_gap(mesh: dolfinx.mesh.Mesh, where: dict[str, Any], x: Any) -> Any:
-    """Return the distance from a capsule; in space from an extruded one along y (UFL)."""
+    """Return the distance from a capsule, extruded along the axes with zero "flat" (UFL)."""
     low, high = (np.array(end, dtype=float) for end in where["ends"])
     arm = x - fem.Constant(mesh, low)
     if (high != low).any():
@@ -493,7 +493,7 @@ def obstacle_geometry(scene: Scene, contact: Scene) -> dict[str, Any]:
         slope = given.get("slope", 0.0)
         normal = up - slope * np.eye(d)[0]
         normal /= np.linalg.norm(normal)
-        # The plane touches the lower vertex of the bottom.
+        # Without clearance the plane touches the lower vertex of the bottom.
         corner = low + (size[0] * np.eye(d)[0] if slope > 0 else 0.0)
         return {"point": (corner - clearance * normal) * length, "normal": normal}
     if given["kind"] == "obstacle":
@@ -516,7 +516,7 @@ def obstacle_geometry(scene: Scene, contact: Scene) -> dict[str, Any]:
     radius = given["radius"] * max(size[:-1])
     if not given["kind"].endswith("inside"):
         return {"center": (middle - (radius + clearance) * up) * length, "radius": radius * length}
-    # The corners of the bottom touch the wall of the cavity.
+    # Without clearance the corners of the bottom touch the wall of the cavity.
     across = size[:-1] if given["kind"].startswith("ball") else size[:1]
     reach = 0.5 * float(np.linalg.norm(across))
     radius = max(radius, 1.2 * reach)
@@ -549,8 +549,8 @@ def _gather_displacement(setup: SceneSetup, u: fem.Function | None = None) -> np
 
 
 def _record_slip_resets(setup: SceneSetup, contact: fc.Contact) -> None:
-    """Record the calls by which a contact moves its slip reference, or finds other pairs."""
-    positions: list[bool] = []  # whether obstacles are where they were: then bodies are positioned
+    """Record the calls that set a contact's slip reference, or its pairs in an increment."""
+    positions: list[bool] = []  # whether points move with obstacles: then bodies are positioned
 
     def displaced(by: Any) -> Any:
         positions[:] = [isinstance(by, ObstacleMotion)]
@@ -559,7 +559,7 @@ def _record_slip_resets(setup: SceneSetup, contact: fc.Contact) -> None:
     def count_from_here(points: Array) -> None:
         (rigid,) = positions
         if rigid and not any(setup.comm.allgather(bool(points.any()))):
-            count(points)  # other bodies are positioned
+            count(points)  # only other bodies are positioned
             return
         unloaded = points & (contact.history.values("normal_traction") == 0.0)
         columns = [contact.points, contact.values.jump, unloaded]
@@ -588,7 +588,7 @@ def _record_slip_resets(setup: SceneSetup, contact: fc.Contact) -> None:
 def _make_record(
     setup: SceneSetup, problem: fc.ContactProblem, step: Any, stage: int, t: float
 ) -> dict[str, Any]:
-    """Return the results of a committed step that are compared. Collective."""
+    """Return the results of a committed increment for the comparison. Collective."""
     comm, d = setup.comm, setup.d
     contacts = []
     for contact in problem.contacts:
@@ -646,12 +646,12 @@ def run_history(
     modify: Any = None,
     setup_class: type[SceneSetup] = SceneSetup,
 ) -> None:
-    """Solve a scene by the package. Collective.
+    """Solve a scene with the package. Collective.
 
     Args:
         scene: The scene.
         comm: Communicator.
-        on_increment: Called with the record of every committed increment, on all ranks.
+        on_increment: Function of the record of every committed increment, called on all ranks.
         modify: Function of setup and problem that introduces an error (tests).
         setup_class: Class of the setup.
     """

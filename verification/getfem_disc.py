@@ -1,17 +1,18 @@
-"""A rubber block under a rigid disc, by GetFEM: numbers for `tests/test_finite_references.py`.
+"""Press a rigid disc into rubber by GetFEM, for `tests/test_finite_references.py`.
 
     python3 verification/getfem_disc.py               # without friction
     python3 verification/getfem_disc.py --friction    # needs GetFEM 5.4, on Debian python3-getfem
 
-Plane strain, a block 10 x 10 held at its bottom, under a disc of radius 4 that stands on the middle
-of its top. W = G/2 (I₁ - 3 - 2 ln J) + λ/4 (J² - 1 - 2 ln J) with E = 1000, ν = 0.3; the disc is a
-penalty of ½ k ⟨R - |x - c|⟩² per undeformed length, k = 1e4. Biquadratic cells of 0.5, three Gauss
-points along each side of them, all derivatives by GetFEM's own assembly language.
+A block in plane strain with fixed bottom is under a disc of radius 4, which touches the middle of
+its top. W = G/2 (I₁ - 3 - 2 ln J) + λ/4 (J² - 1 - 2 ln J) with E = 1000, ν = 0.3; the disc is a
+penalty of ½ k ⟨R - |x - c|⟩² per undeformed length, k = 1e4. Cells are biquadratic, of size 0.5,
+with three Gauss points along each side; GetFEM's assembly language computes all derivatives.
 
-Without friction half of the block is pressed by 3 in twelve increments. With μ = 0.3 all of it is
-pressed likewise, then the disc turns by 0.8 in eight increments, and is dragged by 2 in eight more.
-Friction is -k times what the foot of a point on the disc has moved along the disc since the last
-increment, R sin(θ - θ₀) of its angle there, added to what it was, and no more than μ p.
+Without friction half of a block 10 x 10 is modelled, and the disc pressed in by 3 in twelve
+increments. With μ = 0.3 a block 16 x 10 is pressed in the same way, then the disc rotates by 0.8 in
+eight increments, and is dragged by 2 in eight more. Friction is the value of the last increment
+minus q = 1e3 times the slip since, bounded by μ p. The slip is R sin(θ - θ₀), where θ and θ₀ are
+the angles on the disc of a point's present and last projection.
 """
 
 from __future__ import annotations
@@ -19,19 +20,19 @@ from __future__ import annotations
 import sys
 import time
 
-import getfem as gf  # no dependency: this script alone needs it
+import getfem as gf  # no dependency: this script and getfem_two_bodies.py alone need it
 import numpy as np
 
 E, NU, RADIUS, HEIGHT, DEPTH, STEPS, K = 1000.0, 0.3, 4.0, 10.0, 3.0, 12, 1e4
 KT = 1e3
 MU, TURN, WAY, MORE = 0.3, 0.8, 2.0, 8
 BOTTOM, TOP, MIDDLE = 1, 2, 3
-AWAY = "((X+u-c)/Norm(X+u-c))"  # from the disc's centre
+AWAY = "((X+u-c)/Norm(X+u-c))"  # from the centre of the disc
 PRESSURE = "(k*neg_part(Norm(X+u-c)-R))"
 
 
 def block(left: float, right: float) -> tuple[gf.Model, gf.MeshIm]:
-    """The rubber between two values of x, held at its bottom."""
+    """Return model and integration method of rubber between two x, with fixed bottom."""
     along = np.linspace(left, right, round((right - left) / 0.5) + 1)
     mesh = gf.Mesh("cartesian", along, np.linspace(0, HEIGHT, 21))
     boxes = ([[-9, -1e-6], [9, 1e-6]], [[-9, HEIGHT - 1e-6], [9, 11]], [[-1e-6, -1], [1e-6, 11]])
@@ -58,17 +59,17 @@ def block(left: float, right: float) -> tuple[gf.Model, gf.MeshIm]:
 
 
 def solve(model: gf.Model) -> int:
-    """One increment; Newton iterations."""
+    """Solve one increment; return the number of Newton iterations."""
     made, _ = model.solve("max_iter", 60, "max_res", 1e-9, "lsearch", "simplest")
     return int(made)
 
 
 def without_friction() -> int:
-    """Print the force on half of the disc; Newton iterations."""
+    """Print the force on half of the disc; return the number of Newton iterations."""
     model, rule = block(0.0, 5.0)
     model.add_initialized_data("across", np.array([[1.0, 0.0], [0.0, 0.0]]))
     model.add_initialized_data("zero", [0.0, 0.0])
-    # With multipliers the corner of the top is left free to move by 1e-3.
+    # With multipliers the corner of the top would move by 1e-3.
     model.add_generalized_Dirichlet_condition_with_penalization(
         rule, "u", 1e12, MIDDLE, "zero", "across"
     )
@@ -82,12 +83,12 @@ def without_friction() -> int:
 
 
 def with_friction() -> int:
-    """Print force on the block and torque about the disc's centre; Newton iterations."""
+    """Print force on the block and torque about the disc's centre; return the iterations."""
     model, rule = block(-8.0, 8.0)
     points = gf.MeshImData(rule, TOP)
     across = gf.MeshImData(rule, TOP, 2)
-    model.add_im_data("before", across)  # where the foot was, as a direction from the centre
-    model.add_im_data("borne", points)  # friction then, positive along [-y; x] of that direction
+    model.add_im_data("before", across)  # last projections, as directions from the centre
+    model.add_im_data("borne", points)  # last friction, positive along [-y; x] of these
     model.add_initialized_data("mu", [MU])
     model.add_initialized_data("turn", [1.0, 0.0])  # cosine and sine of the last increment's angle
     along = f"([0,-1;1,0]*{AWAY})"
@@ -112,7 +113,7 @@ def with_friction() -> int:
         model.set_variable("turn", [np.cos(angle - done), np.sin(angle - done)])
         iterations += solve(model)
         traction = f"({PRESSURE}*{AWAY}+{friction}*{along})"
-        # What the block feels is the opposite of what its stresses balance: p against AWAY.
+        # The contact force on the block is minus the contact terms of the residual: p along AWAY.
         x, y = (gf.asm("generic", rule, 0, f"{traction}({i})", TOP, model) for i in (1, 2))
         torque = gf.asm("generic", rule, 0, f"Norm(X+u-c)*{friction}", TOP, model)
         keep()
@@ -122,7 +123,7 @@ def with_friction() -> int:
 
 
 def main() -> None:
-    """Solve and print."""
+    """Solve with or without friction, and print the forces."""
     gf.util_trace_level(0)
     start = time.process_time()
     iterations = with_friction() if "--friction" in sys.argv else without_friction()

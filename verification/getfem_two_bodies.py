@@ -1,19 +1,20 @@
-"""A block of rubber dragged over another one, by GetFEM, for `tests/test_finite_references.py`.
+"""Drag a rubber block over another one by GetFEM, for `tests/test_finite_references.py`.
 
     python3 verification/getfem_two_bodies.py                    # by penalty, with μ = 0.3
     python3 verification/getfem_two_bodies.py --frictionless     # needs GetFEM 5.4, on Debian
     python3 verification/getfem_two_bodies.py --brick            # python3-getfem
 
-The scene of scenes/rubbed.py, mesh and elements as there: biquadratic cells, three Gauss points
-along each side of them. Points of the upper block find their partners by GetFEM's raytracing.
+Scene, mesh and elements are those of scenes/rubbed.py: biquadratic cells with three Gauss points
+along each side. GetFEM's raytracing pairs points of the upper block with the lower block.
 
-By penalty: p = k ⟨-g⟩ per undeformed length of the upper block's lower side, g the way to the lower
-block along its present normal n, and friction -q times the slip since the last increment, added to
-what it was, and no more than μ p. Slip is t₀·(u - w + g (n - n₀)), u less w at both ends of the
-ray: w and n₀, t₀ are displacement, normal and tangent of the last increment. All derivatives are
-GetFEM's. With ``--brick`` its own brick for large sliding does all that, with multipliers that are
-linear along the side: an augmented Lagrangian, without penetration where these are tested. Newton's
-method takes full steps; with the line search "simplest" it takes 18 to 38 of them an increment.
+The penalty pressure is p = k ⟨-g⟩ per undeformed length of the lower side of the upper block, with
+the gap g to the lower block along the present normal n of the upper block. Friction is the value of
+the last increment minus q times the slip since, bounded by μ p. With the jump u - w between both
+ends of the ray the slip is t₀·(u - w + g (n - n₀)), where w, n₀ and t₀ are displacement, normal and
+tangent of the last increment. GetFEM computes all derivatives. ``--brick`` uses GetFEM's brick for
+large sliding instead: an augmented Lagrangian with multipliers linear along the side, without
+penetration where they are tested. Newton's method takes full steps; line search "simplest" needs 18
+to 38 of them per increment.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ LOWER, UPPER = 0, 1
 
 
 def block(number: int) -> tuple[gf.Mesh, gf.MeshFem, gf.MeshIm]:
-    """One of the blocks: its mesh, displacements and points."""
+    """Return mesh, displacement space and integration method of a block."""
     origin, size, n, _ = BLOCKS[number]
-    # Bilinear cells: those of "cartesian" meshes are affine, and stay so when points are moved.
+    # Cells are bilinear, as cells of "cartesian" meshes are affine even after points are moved.
     shape = f"ORG={list(origin)};SIZES={list(size)};NSUBDIV={list(n)}"
     mesh = gf.Mesh("import", "structured", f"GT='GT_QK(2,1)';{shape}")
     at, far = 1e-6, 1e3
@@ -56,7 +57,7 @@ def block(number: int) -> tuple[gf.Mesh, gf.MeshFem, gf.MeshIm]:
 
 
 def bulk(model: gf.Model, rule: gf.MeshIm, name: str, modulus: float) -> None:
-    """The block's energy."""
+    """Add the strain energy of a block to the model."""
     shear, lame = modulus / (2 * (1 + NU)), modulus * NU / ((1 + NU) * (1 - 2 * NU))
     gradient = f"(Id(2)+Grad_{name})"
     model.add_nonlinear_term(
@@ -67,10 +68,10 @@ def bulk(model: gf.Model, rule: gf.MeshIm, name: str, modulus: float) -> None:
 
 
 class ByPenalty:
-    """Penalty and friction written by hand on GetFEM's raytracing."""
+    """Penalty and friction as expressions in GetFEM's assembly language, with its raytracing."""
 
     def __init__(self, model: gf.Model, blocks: list, mu: float) -> None:
-        """Add them to the model."""
+        """Add penalty and friction to the model."""
         (mesh2, space2, _), (mesh1, space1, self.rule) = blocks
         self.model, self.mu = model, mu
         model.add_raytracing_transformation("ray", RAY)
@@ -96,7 +97,7 @@ class ByPenalty:
         model.add_nonlinear_term(self.rule, f"Interpolate_filter(ray,{term},1)", CONTACT)
 
     def force(self) -> np.ndarray:
-        """On the upper block."""
+        """Return the contact force on the upper block."""
         return np.array(
             [
                 gf.asm(
@@ -112,7 +113,7 @@ class ByPenalty:
         )
 
     def keep(self) -> None:
-        """Let the present state be the committed one."""
+        """Commit the present state."""
         model = self.model
         if self.mu:
             told = f"Interpolate_filter(ray,{self.friction},1)"
@@ -126,7 +127,7 @@ class ByBrick:
     """GetFEM's brick for large sliding, with multipliers on the upper block."""
 
     def __init__(self, model: gf.Model, blocks: list, mu: float) -> None:
-        """Add it to the model."""
+        """Add the brick to the model."""
         (_, space2, rule2), (mesh1, space1, self.rule) = blocks
         self.model = model
         linear = gf.MeshFem(mesh1, 2)
@@ -147,19 +148,19 @@ class ByBrick:
         )
 
     def force(self) -> np.ndarray:
-        """On the upper block."""
+        """Return the contact force on the upper block."""
         return np.array(
             [gf.asm("generic", self.rule, 0, f"m({i})", CONTACT, self.model) for i in (1, 2)]
         )
 
     def keep(self) -> None:
-        """Let the present state be the committed one."""
+        """Commit the present state."""
         for i in "12":
             self.model.set_variable("w" + i, self.model.variable("u" + i))
 
 
 def main() -> None:
-    """Solve and print."""
+    """Solve all increments, and print the contact force of each."""
     gf.util_trace_level(0)
     gf.util_warning_level(0)
     start, clock = time.process_time(), time.perf_counter()

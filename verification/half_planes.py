@@ -24,7 +24,7 @@ GROUND, LOAD, AXIS, SURFACE, OPPOSITE = 1, 2, 3, 4, 5
     budget="the force is given; peak pressure and displacement are infinite",
 )
 def flat_punch() -> Outcome:
-    """Press a flat punch by a force (half modelled): pressure and load within |x| ≤ 0.9 a."""
+    """Press a flat punch by a force (half modelled); compare pressure and load in |x| ≤ 0.9 a."""
     a, force, far = 1.0, 1.0, 50.0
     # Graded towards the corner from both sides.
     fine = graded(0.05, 8, 1.0, 1.15)
@@ -127,7 +127,7 @@ def wavy(n: int = 256) -> Outcome:
 def cylinder_on_block(h: float):
     """Mesh half of a cylinder of radius 50 on half of a block of 200 × 200, in mm. Collective.
 
-    Cells of size ``h`` at the contact on the block, 0.8 ``h`` on the cylinder.
+    At the contact cells have size ``h`` on the block, and 0.8 ``h`` on the cylinder.
     """
     radius, side = 50.0, 200.0
     gmsh.initialize()
@@ -138,7 +138,7 @@ def cylinder_on_block(h: float):
         if COMM.rank == 0:
             occ = gmsh.model.occ
             foot, centre = occ.addPoint(0, 0, 0), occ.addPoint(0, radius, 0)
-            wide, steep = 0.4, np.pi - 0.2  # where contact may be; where the load is
+            wide, steep = 0.4, np.pi - 0.2  # angles: end of Γc, and start of the load
 
             def on(angle: float) -> int:
                 return occ.addPoint(radius * np.sin(angle), radius * (1 - np.cos(angle)), 0)
@@ -188,14 +188,14 @@ def cylinder_on_block(h: float):
 def cylinder(h: float = 0.25, stiffness: float = 10.0) -> Outcome:
     """Press a steel cylinder on a block of 70 GPa by 35 kN/mm, without friction.
 
-    Cells of size ``h``, a penalty of ``stiffness`` E/h.
+    Cells at the contact have size ``h``; the penalty is ``stiffness`` E/h.
     """
     made = cylinder_on_block(h)
     body = Bodies(made, _moduli(made[0], 210e3, 70e3), 0.3, degree=2)
     body.hold(GROUND, 0, 1)
     body.hold(AXIS, 0)
     total = 35e3
-    # Traction on a cap, with the given resultant.
+    # The traction on the cap of the cylinder has the given resultant.
     width = _integral(body, LOAD)
     load = body.constant(0.0)
     body.F += load / width * body.v[1] * body.ds(LOAD)
@@ -232,7 +232,7 @@ def _integral(body: Bodies, tag: int) -> float:
 
 
 def _half_width(points) -> float:
-    """Return the end of the contact, linear between the last closed and the first open point."""
+    """Return the end of the contact, interpolated between the last closed and first open point."""
     x, gap = points["x"][:, 0], points["gap"]
     i = int(np.flatnonzero(gap < 0)[-1])
     return float(x[i] + (x[i + 1] - x[i]) * gap[i] / (gap[i] - gap[i + 1]))

@@ -16,7 +16,7 @@ from numpy.polynomial import legendre
 __all__ = ["Body", "Surface", "find_overlap", "find_pairs", "smooth_modulus"]
 
 Array = np.ndarray
-# Fraction of a facet that may lack an opposing facet, and reach of facets beyond their edges.
+# Fraction of a facet that may lack an opposing facet; reference tolerance at the edges of facets.
 _COVERED = 1e-6
 _OVERLAP = 1e-6
 
@@ -92,7 +92,7 @@ class Surface:
     def position(self, facet: Array, xi: Array, u: Array | None = None) -> tuple[Array, Array]:
         """Return coordinates, (n, d), and tangents, (n, d - 1, d), of points displaced by u.
 
-        u has all dofs, or the displacements of the nodes of every point's cell, (n, m, d).
+        ``u`` has all dofs, or the displacements of the nodes of every point's cell, (n, m, d).
         """
         inside = self._cell_coordinates(facet, xi)
         table = _tabulate(self._map, 1, inside)
@@ -111,7 +111,7 @@ class Surface:
         return u.reshape(-1, self.d)[self.body.nodes[self.cells[facet]]]
 
     def shapes(self, facet: Array, xi: Array) -> Array:
-        """Return the shape functions of these nodes at points, (n, m)."""
+        """Return the shape functions of the nodes of the facets' cells at points, (n, m)."""
         return _tabulate(self._element, 0, self._cell_coordinates(facet, xi))[0]
 
     def _area_vector(self, facet: Array, xi: Array, u: Array | None = None) -> Array:
@@ -233,7 +233,7 @@ def _tabulate(element: Any, derivatives: int, points: Array) -> Array:
 
 
 def smooth_modulus(surface: Surface, modulus: Array, facet: Array, xi: Array) -> Array:
-    """Return E/h at points of Γc, smoothed over four facets as in `accuracy.modulus_over_height`.
+    """Return E/h at points of Γc, smoothed over four facets as in `modulus_over_height`.
 
     Args:
         surface: Γc.
@@ -288,7 +288,7 @@ def find_pairs(
         master: The opposing surface.
         points: Facet and reference coordinates of every point.
         max_distance: Largest distance (length).
-        u: Displacement at which pairs are found; None: undeformed.
+        u: Displacement at which pairs are found; None for the undeformed bodies.
 
     Returns:
         Interpolation matrix of the opposing displacement, (n_points, n_nodes); the gap in the
@@ -342,7 +342,7 @@ def find_overlap(surface: Surface, opposite: Surface, u: Array, weight: float) -
 
 
 def _complete_polynomials(surface: Surface, n_points: int) -> Any:
-    """Return Legendre polynomials of the largest complete space with at most so many members."""
+    """Return Legendre polynomials of the largest complete space of at most ``n_points`` members."""
     d = surface.d
     if d == 2:
         return lambda s: legendre.legvander(2 * s[:, 0] - 1, n_points - 1)
@@ -367,7 +367,7 @@ def _complete_polynomials(surface: Surface, n_points: int) -> Any:
 def _cut_quadrature(
     slave: Surface, master: Surface, f: int, u: Array | None
 ) -> tuple[Array, Array]:
-    """Return points on facet f and weights, on its intersections with the opposing facets."""
+    """Return points and weights of the intersections of facet f with the opposing facets."""
     corners, others = slave.corners(u)[f], master.corners(u)
     mean = slave.normal(*slave.midpoints())[f]
     facing = master.normal(*master.midpoints()) @ mean < 0

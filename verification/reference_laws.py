@@ -91,7 +91,7 @@ class Law:
         overclosure: Array,
         prescribed_bound: Array | None,
     ) -> Array:
-        """Return τ for Δu_t, the committed τ and u_t, all (n, d).
+        """Return τ, (n, d), for Δu_t, the committed τ and u_t, (n, d) each.
 
         Δu_t, u_t, r_n and the overclosure may have an additional first axis.
         ``prescribed_bound`` replaces the friction bound of the law.

@@ -25,7 +25,7 @@ __all__ = ["ContactModel", "Failed", "Load", "Problem", "State"]
 Array = np.ndarray
 # Step of complex-step derivatives, which have no truncation error.
 _COMPLEX_STEP = 1e-60
-# Reciprocal condition number above which a system is solved by LU, not by least squares.
+# Reciprocal condition number above which a system is solved by LU, and else by least squares.
 _MIN_RCOND = 1e-8
 
 
@@ -40,7 +40,7 @@ class State:
         jump: Slip reference: the relative displacement at which Δu_t = 0, (n, d) (length).
         traction: τ, or with multipliers λ_t, (n, d) (stress).
         pressure: λ_n, (n,) (stress); None without multipliers.
-        friction_bound: Prescribed friction bound, (n,) (stress); None: that of the law.
+        bound: Prescribed friction bound, (n,) (stress); None for the bound of the law.
     """
 
     jump: Array
@@ -59,17 +59,17 @@ class ContactModel:
         interpolation: Matrix from nodes to the displacement jump, (n, n_nodes).
         weights: Quadrature weights, (n,).
         k_n, k_t: Contact stiffness, (n,).
-        law: The law.
+        law: The contact law.
         paired: Whether points may carry tractions, (n,).
         free_components: Components of the obstacle's motion that are unknowns.
         projection: L2 projection of the multipliers, (n, n); None without multipliers.
         update_pairs: Updates the pairs for a displacement; None if pairs are fixed.
-        opposite_penetration: Integrates the penetration on the opposing surface for a
-            displacement; None on a rigid obstacle.
+        overlap: Integrates the penetration on the opposing surface for a displacement; None on a
+            rigid obstacle.
         slave: Γc.
         facet: Facet of every point.
         deformed_gap: Returns gap and normal at points (n, d) for an obstacle displacement; None
-            if the obstacle is no rigid shape.
+            if the obstacle is not a rigid shape.
         radius: Radius of a round obstacle, for its round-off (length).
         centreline: Centreline of a rod in its first position, (n, d); None for other obstacles.
         current_pairs: Returns interpolation, gap and pairs of deformed bodies for u; None on a
@@ -98,7 +98,7 @@ class ContactModel:
 
     @property
     def d(self) -> int:
-        """Dimension."""
+        """Dimension of space."""
         return int(self.x.shape[1])
 
     def initial_state(self) -> State:
@@ -228,7 +228,7 @@ class Load:
     Attributes:
         force: Load vector, (N,) (force).
         fixed: Dirichlet dofs.
-        values: Their values (length).
+        values: Values of the Dirichlet dofs (length).
         shifts: Prescribed displacement of the obstacle of every contact, (d,); 0 if free.
         obstacle_forces: Force on the obstacle of every contact, (d,).
     """
@@ -253,7 +253,7 @@ class CondensedSystem:
         retained, eliminated: Retained dofs, n, and eliminated ones.
         stiffness: Condensed stiffness, (n + m, n + m).
         stick_stiffness: Condensed stiffness with all points sticking, which is regular.
-        scale: Square root of the diagonal of that.
+        scale: Square root of the diagonal of `stick_stiffness`.
         maps: Matrix from the n dofs to the jump of every contact, (n_points d, n).
         operators: Matrix D from all n + m unknowns to the relative displacement of every contact.
         motion_columns: Columns of the free motions of every contact, and their components.
@@ -333,7 +333,7 @@ class CondensedSystem:
         return _norm(total)
 
     def step(self, matrix: Array, residual: Array) -> Array:
-        """Return the Newton step; with the sticking stiffness if the tangent is singular."""
+        """Return the Newton step, with the sticking stiffness if the tangent is singular."""
         system = matrix / self.scale[:, None] / self.scale
         right = -residual / self.scale
         size = np.abs(system).sum(axis=0).max(initial=0.0)
@@ -351,7 +351,7 @@ class Trial:
 
     Attributes:
         z: The n + m unknowns of `CondensedSystem`.
-        residual: Residual of these.
+        residual: Residual of these unknowns.
         size: The largest force.
         jumps, shifts, forces: Jump, obstacle displacement and force of every contact.
     """
@@ -473,7 +473,7 @@ class Problem:
     def equilibrate(
         self, u: Array, motion: Array, load: Load, old: list[State], rtol: float
     ) -> tuple[Array, Array]:
-        """Solve by Newton's method; after a failure start from a fixed point of Tresca problems."""
+        """Solve by Newton's method; if it fails, restart from a sequence of Tresca problems."""
         try:
             return self._newton(u, motion, load, old, rtol)
         except (Failed, np.linalg.LinAlgError) as failure:
@@ -556,7 +556,7 @@ class Problem:
             share, slope = 1.0, now.residual @ step
             low, high = (0.0, slope), None
             first = _norm(now.residual / condensed.scale)
-            # The line search of the paper looks for a zero of the energy's slope along the step.
+            # As in the source paper the line search finds a zero of the energy's slope.
             # The step is doubled as long as an unconstrained body has not met its obstacle.
             for _ in range(60):
                 trial, tried = evaluate(now.z + share * step), share
@@ -576,10 +576,10 @@ class Problem:
                     part = low[1] / (low[1] - high[1])
                     share = low[0] + np.clip(part, 0.1, 0.9) * (high[0] - low[0])
             if iteration % 9 == 8 and not convex:
-                share = 1.0 if iteration % 18 == 8 else 0.37  # out of a cycle
+                share = 1.0 if iteration % 18 == 8 else 0.37  # leaves a cycle
             now = trial if share == tried else evaluate(now.z + share * step)
         norm, now = best
-        # Forces that carry a body along excuse none of its loads, nor does round-off.
+        # Neither large internal forces nor round-off excuse a residual above 1e-3 of the load.
         limits = rtol * now.size, 1e-14 * condensed.roundoff(now.z, now.forces)
         excused = max(1e3 * limits[0], 1e2 * limits[1])
         if norm > max(min(excused, 1e-3 * _norm(load.force) or np.inf), *limits):

@@ -22,7 +22,7 @@ def read(path: Path) -> list[dict[str, str]]:
 
 
 def save(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows to a CSV file with all digits; the columns are those of any row."""
+    """Write rows to a CSV file with all digits; its columns are those of all rows together."""
     columns = list(dict.fromkeys(column for row in rows for column in row))
     with open(path, "w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=columns, lineterminator="\n")
@@ -31,7 +31,7 @@ def save(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def number(value: float | str, digits: int = 3) -> str:
-    """Format a number for a table; an empty text remains empty."""
+    """Format a number for a table; an empty string remains empty."""
     return "" if value == "" else f"{float(value):.{digits}g}"
 
 

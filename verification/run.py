@@ -4,7 +4,7 @@ python verification/run.py
 python verification/run.py --only punch wavy --output /tmp/page.md
 python verification/run.py --page
 
-``--only`` replaces the rows of some cases, ``--page`` writes the page of the stored rows. The exit
+``--only`` replaces the rows of some cases; ``--page`` writes the page of the stored rows. The exit
 code is 1 if a quantity misses its reference or a case fails.
 """
 
@@ -34,7 +34,7 @@ Row = dict[str, str]
 
 
 def rows_of(case: Case, outcome: Outcome | str) -> list[Row]:
-    """Return the rows of a case; a text is the error that it failed with."""
+    """Return the rows of a case; ``outcome`` is the error message if the case has failed."""
     petsc = ".".join(map(str, PETSc.Sys.getVersion()))
     versions = f"fenics_contact {fc.__version__}, DOLFINx {dolfinx.__version__}, PETSc {petsc}"
     common = {"basis": case.reason, "versions": versions}
@@ -146,7 +146,7 @@ def draw(path: Path, rows: list[Row]) -> None:
 
 
 def main() -> int:
-    """Solve and write; 0 if all references are met."""
+    """Solve the cases and write the results; return 0 if all references are met."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", nargs="+", metavar="WORD", help="cases with one of these words")
     parser.add_argument("--output", type=Path, help="page to write, with a CSV file beside it")

@@ -4,9 +4,9 @@ python verification/shallow_ironing.py            # computes missing runs, write
 python verification/shallow_ironing.py --jobs 2
 python verification/shallow_ironing.py --page     # page and figures of the stored runs
 
-Each run is a process of its own. Rows and curves are stored at its end in
+Each run is a separate process. Rows and curves are stored at its end in
 ``verification/shallow_ironing.csv`` and ``shallow_ironing_curves.csv``; an interrupted study
-continues with the missing runs. Writes docs/shallow_ironing.md and its figures.
+continues with the missing runs. The script writes docs/shallow_ironing.md and its figures.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ STUDY = ROOT / "verification" / "shallow_ironing.csv"
 CURVES = STUDY.with_name("shallow_ironing_curves.csv")
 PAGE = ROOT / "docs" / "shallow_ironing.md"
 TIMEOUT = 7200.0  # s, of one run
-# Times in which V and H are fitted by a parabola, as they oscillate when facets pass the die.
+# Interval in which V and H, which oscillate as facets pass the die, are fitted by a parabola.
 WINDOW = (1.4, 1.6)
 QUANTITIES = ("V(1)", "V(1.5)", "H(1.5)")
 RESULTS = (
@@ -49,7 +49,7 @@ BASE = Setting(until=2.0)
 
 
 def sized(size: float, increments: int, until: float = 1.6) -> Setting:
-    """Return the base on another mesh, with the same stiffness and a fifth of a facet per step."""
+    """Return the base run on another mesh: equal stiffness, increments of a fifth of a facet."""
     stiffness = BASE.stiffness * size / BASE.size
     return replace(BASE, size=size, increments=increments, until=until, stiffness=stiffness)
 
@@ -57,7 +57,7 @@ def sized(size: float, increments: int, until: float = 1.6) -> Setting:
 def settings() -> dict[str, Setting]:
     """Return all runs by name, in order.
 
-    Some variants differ from the base, all others from a mesh coarser by a factor of √2.
+    Some variants are on the mesh of the base run, most others on a mesh coarser by a factor of √2.
     """
     short, coarse = replace(BASE, until=1.6), sized(0.283, 180)
     runs = {
@@ -110,7 +110,7 @@ def evaluate(path: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def run(setting: Setting) -> tuple[dict[str, Any], list[tuple[float, float, float]]]:
-    """Solve; return results of the row, and t, V, H of all increments."""
+    """Solve one run; return the results of its row, and t, V, H of all increments."""
     start = time.process_time()
     path, _, _, dofs = solve(setting)
     iterations = [int(row["iterations"]) for row in path]
@@ -125,7 +125,7 @@ def run(setting: Setting) -> tuple[dict[str, Any], list[tuple[float, float, floa
 
 
 def started(name: str) -> tuple[dict[str, Any], list[tuple[float, float, float]]]:
-    """Run in a process of its own; return a row with a failure if it does not end normally."""
+    """Run in a separate process; return a row with the failure if it does not end normally."""
     words = command(1, Path(__file__), "--one", name)
     try:
         done = subprocess.run(
@@ -154,7 +154,7 @@ def append(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]]) ->
 
 
 def stored(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a file, which need not exist."""
+    """Return the rows of a file, or no rows if it does not exist."""
     return report.read(path) if path.exists() else []
 
 
@@ -176,7 +176,7 @@ def curves() -> dict[str, np.ndarray]:
 
 
 def study(names: Sequence[str], jobs: int) -> None:
-    """Compute the missing runs."""
+    """Compute and store the missing runs among ``names``, ``jobs`` at a time."""
     done = {row["name"] for row in stored(STUDY)}
     lock = Lock()
 

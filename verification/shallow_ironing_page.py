@@ -1,8 +1,8 @@
 """Evaluation of the runs of `verification/shallow_ironing.py`: limits, errors, page and figures.
 
-The mesh error is Richardson's: an order and a limit from all sizes, or the range of the values if
-they show no order. All other contributions are differences of two runs on one mesh. The error is
-the sum of all contributions, as if they had the same sign.
+The mesh error is estimated by Richardson extrapolation over all mesh sizes, or from the range of
+the values if no convergence order is observed. All other contributions are differences of two runs
+on one mesh. The error is the sum of all contributions, as if they had the same sign.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from verification import report
 
 Rows = Mapping[str, Mapping[str, float]]  # results by name of the run and of the quantity
 
-# Names in the tables, and in the rows; at t = 1.5 without the oscillation.
+# Names in the tables and in the rows; values at t = 1.5 are fitted, without the oscillation.
 QUANTITIES = {"V(1)": "V(1)", "V(1.5)": "fitted V(1.5)", "H(1.5)": "fitted H(1.5)"}
 # V(1), V(1.5), H(1.5) [N/mm], read from published curves.
 PUBLISHED = {
@@ -65,7 +65,7 @@ def richardson(sizes: Sequence[float], values: Sequence[float]) -> Limit:
 
     Roache, J. Fluids Eng. 116, 1994; for more than three meshes Eça and Hoekstra, J. Comput. Phys.
     262, 2014. If the values are monotonic and a + c h^p fits best with p between 1/2 and 4, the
-    error is 1.25 times the distance from the value of the finest mesh, plus the worst misfit.
+    error is 1.25 times the distance from the value of the finest mesh, plus the largest misfit.
     Otherwise the limit is the finest value, and the error 3 times the range of all values over
     largest size / smallest size - 1, as for order one.
     """
@@ -81,21 +81,21 @@ def richardson(sizes: Sequence[float], values: Sequence[float]) -> Limit:
 
 
 def _fit(h: np.ndarray, f: np.ndarray, order: float) -> tuple[float, float]:
-    """Fit a + c h^order by least squares; return a and the worst misfit."""
+    """Fit a + c h^order by least squares; return a and the largest misfit."""
     terms = np.column_stack([np.ones_like(h), h**order])
     solution = np.linalg.lstsq(terms, f, rcond=None)[0]
     return float(solution[0]), float(np.abs(terms @ solution - f).max())
 
 
 def meshes(rows: Rows, quantity: str) -> Limit:
-    """Return the limit of a quantity, from the runs that have it."""
+    """Return the mesh limit of a quantity, from the runs that have a value of it."""
     key = QUANTITIES[quantity]
     found = [(size, rows[name][key]) for name, size in MESHES.items() if key in rows[name]]
     return richardson(*zip(*found, strict=True))
 
 
 def differences(rows: Rows, quantity: str) -> dict[str, float]:
-    """Return the difference of a quantity, by run, from the run that differs in one parameter."""
+    """Return, by run, the change of a quantity from run "size …" of its name, or else "base"."""
     key = QUANTITIES[quantity]
     found = {}
     for name, row in rows.items():
@@ -238,10 +238,10 @@ def budget(rows: Rows) -> list[str]:
 def corrected(
     rows: Rows, name: str, t: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the curve of the base, V or H, scaled to the limit, and its error.
+    """Return the curve of the base run, V or H, scaled to the limit, and its error.
 
-    Scale and relative error are those at t = 1 before (of V, for H as well), those at t = 1.5
-    after, and linear in between.
+    Scale and relative error are those of V(1) up to t = 1, also for H, and those at 1.5 from
+    t = 1.5 on, with linear interpolation in between.
     """
     scales, bars = [], []
     for quantity in ("V(1)", f"{name}(1.5)"):

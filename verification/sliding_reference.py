@@ -1,9 +1,9 @@
 """The independent solver for finite sliding of two bodies, and its comparison.
 
-The present normal of every point of Γc is intersected with every facet of the opposing surface.
-Slip and the rotation of surface and traction are evaluated from the displacements of both bodies;
-shape functions distribute the forces. The tangent is a finite difference, node by node. Shared with
-the package are DOLFINx's assembly of the bulk and the scene.
+Rays along the present normals of the points of Γc are intersected with every opposing facet. Slip
+and the rotation of surface and traction are evaluated from the displacements of both bodies; shape
+functions distribute the forces to the nodes. The tangent is a finite difference by every dof. Only
+the scene and DOLFINx's assembly of the bulk are shared with the package.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ Array = np.ndarray
 
 # Step of finite differences relative to the mesh size.
 _DIFFERENCE = 1e-7
-# Numbers of parts of an increment that are tried.
+# Numbers of parts into which an increment is divided, in the order of attempts.
 _PARTS = (1, 8)
-# Round-off of positions, whose differences are gaps and strains, times the diagonal of K.
+# Relative round-off of positions, whose differences are gaps and strains.
 _PLACES = 100 * np.finfo(float).eps
 
 
 @dataclass(eq=False)
 class SlidingState(reference.State):
-    """Committed state; vectors are those of the committed configuration.
+    """Committed state of a contact, with vectors in the committed configuration.
 
     Attributes:
         jump: Remaining elastic slip with multipliers (length).
         traction: τ, or with multipliers λ_t.
-        u: Committed displacement.
+        u: Committed displacement of all nodes (length).
         depth: Penetration at the commit, (n,) (length); None before the first commit.
     """
 
@@ -55,8 +55,8 @@ class SlidingContact(reference.ContactModel):
         master: The opposing surface.
         xi: Reference coordinates of the points on Γc.
         outlines: The four sides of both bodies in the plane, slave first.
-        max_distance: Largest penetration at which a point is paired, by facets of both sides
-            (length); or twice the committed penetration of the facet.
+        max_distance: By facets of both sides, the largest penetration at which a point is paired,
+            unless twice the committed penetration of its facet is larger (length).
     """
 
     master: Any = None
@@ -93,7 +93,7 @@ class SlidingContact(reference.ContactModel):
         return n_new, turn, n_old
 
     def partners(self, u: Array, old: SlidingState) -> Array:
-        """Return the opposing facet of every point, or -1."""
+        """Return the number of the opposing facet of every point; -1 without one."""
         depth = np.zeros(len(self.slave.facets))
         if old.depth is not None:
             np.maximum.at(depth, self.facet, old.depth)
@@ -121,7 +121,7 @@ class SlidingContact(reference.ContactModel):
     def _evaluate(
         self, rows: Array, hit: Array, own: Array, other: Array, old: Any
     ) -> dict[str, Array]:
-        """Evaluate some points for displacements of the nodes of the cells on both sides."""
+        """Evaluate a subset of points, given the nodal displacements of the cells on both sides."""
         law, facet, xi = self.law, self.facet[rows], self.xi[rows]
         own_before = self.slave.local(facet, old.u)
         n, turn, n_old = self.rotation(own, own_before, rows)
@@ -153,7 +153,7 @@ class SlidingContact(reference.ContactModel):
         return found | {"shapes": shares}
 
     def _nodes(self, hit: Array) -> tuple[Array, Array]:
-        """Return the nodes of the cells on both sides, (n, m) each."""
+        """Return the nodes of the cells of every point on both sides, (n, m) each."""
         slave, master = self.slave, self.master
         partner = np.maximum(hit, 0)
         return slave.body.nodes[slave.cells[self.facet]], master.body.nodes[master.cells[partner]]
@@ -187,7 +187,7 @@ class SlidingContact(reference.ContactModel):
         return matrix
 
     def tied_stiffness(self, found: dict[str, Array]) -> Array:
-        """Return the stiffness of springs that tie all points to their pairs, (N, N)."""
+        """Return the stiffness of springs that bond all points to the opposing body, (N, N)."""
         across = np.zeros((len(self.x), self.interpolation.shape[1]))
         rows = np.arange(len(self.x))[:, None]
         for nodes, share in zip(self._nodes(found["pairs"]), found["shapes"], strict=True):
@@ -224,11 +224,11 @@ class SlidingProblem(finite_reference.FiniteProblem):
         return [c.evaluate_at(u, o) for c, o in zip(self.contacts, old, strict=True)]
 
     def contact_force(self, found: list[dict]) -> list[Array]:
-        """Return the force of every contact on the bodies, (N,) each."""
+        """Return the nodal forces of every contact on both bodies, (N,) each."""
         return [c.force(f) for c, f in zip(self.contacts, found, strict=True)]
 
     def shifts(self, load: Any, motion: Array) -> list[Any]:
-        """Return None for every contact, as there are no obstacles."""
+        """Return None for every contact, as there are no rigid obstacles."""
         return [None for _ in self.contacts]
 
     def _tangent(
@@ -281,7 +281,7 @@ class SlidingJudge(finite_reference.FiniteJudge):
             self.problem.contacts, self._state, record["contacts"], strict=True
         ):
             if c.projection is not None and c.law.has_friction:
-                # The record has them in the present configuration.
+                # The record has λ_t in the present configuration, the state in the committed one.
                 back = np.empty_like(reported["lambda_t"])
                 row = self._rows_of(c, reported)
                 back[row] = np.einsum(
@@ -299,7 +299,7 @@ class SlidingJudge(finite_reference.FiniteJudge):
         return SlidingState(old.jump, traction, record["lambda_n"][row], None, old.u, old.depth)
 
     def _forces(self, u: Array, load: Any, found: list[dict]) -> dict[str, Any]:
-        """Add the round-off of positions, of the other body and of the last increment."""
+        """Add the round-off of positions, of the other body and of the previous increment."""
         forces = super()._forces(u, load, found)
         before = [] if self._before is None else self._before["bodies"]
         most = max(body["rounding"] for body in [*forces["bodies"], *before])
@@ -310,7 +310,7 @@ class SlidingJudge(finite_reference.FiniteJudge):
         return forces
 
     def _check_penetration(self, name: str, u: Array, load: Any, motion: Array, found: Any) -> None:
-        """Check the penetration of both surfaces into the other body, in the plane."""
+        """Check the penetration of both surfaces into the opposing body, in 2D."""
         for i, (c, f) in enumerate(zip(self.problem.contacts, found, strict=True)):
             if c.d != 2 or not c.law.has_normal:
                 continue
@@ -329,7 +329,7 @@ class SlidingJudge(finite_reference.FiniteJudge):
 
     @staticmethod
     def _spline_gap(sides: list[Any], u: Array) -> Array:
-        """Return points around a body, anticlockwise from its lower left corner."""
+        """Return the outline of a body as points, anticlockwise from its lower left corner."""
         rows = []
         for k, side in enumerate(sides):
             x, start, _ = fuzz_judge.sample_surface(side, u)

@@ -1,8 +1,8 @@
 """Random scenes of two bodies with finite sliding: a block pressed on a slab, slid and rotated.
 
 A scene is a dictionary as in `fuzz_scenes`, with ``"kinematics": "finite sliding"``. The bottom of
-the slab is fixed; the top of the block is moved, or pressed by a force. Stages also have the angle
-of the block ("turn") and that of both bodies together ("spin").
+the slab is fixed; the top of the block has a prescribed displacement, or is pressed by a force.
+Stages also have the angle of the block ("turn") and that of both bodies together ("spin").
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def draw(
     d = 3 if space else 2
     strain = log(-3, -0.9)
 
-    # Either of slab and block may have the finer mesh or the higher modulus.
+    # Either body may have the finer mesh or the higher modulus.
     most = 2 if space else (8 if degree == 1 else 5)
     coarse = int(rng.integers(1, 3))
     fine = int(rng.integers(2, most + 1))
@@ -144,7 +144,7 @@ def draw(
         }[name]
         if name in ("turn", "both"):
             rock += strain * rng.uniform(-1, 1) * rocks
-            # A linear body swells by rotation.
+            # Rotation causes swelling of a linear body.
             spin += rng.uniform(-1.5, 1.5) * spins * (1.0 if scene["bulk"] == "rubber" else 0.2)
         stages.append(
             {
@@ -174,10 +174,10 @@ def draw(
 
 
 def _make_dissimilar(scene: Scene, rng: np.random.Generator) -> None:
-    """Make facets up to 20 times as wide as the others, and moduli up to 1e6 times as large.
+    """Make facets up to 20 times as wide, and moduli 1e3 to 1e6 times as large, as the others.
 
-    The block is nearly as wide as the slab, to limit the number of cells. The ratio is 10 for
-    degree 2, and 4 in space.
+    The block is nearly as wide as the slab, to limit the number of cells. The largest ratio of
+    widths is 10 for degree 2, and 4 in 3D.
     """
     slab, block = scene["bodies"]
     wide, room = block["size"], slab["size"][0]
@@ -193,7 +193,7 @@ def _make_dissimilar(scene: Scene, rng: np.random.Generator) -> None:
 
 
 def turn(d: int, angle: float) -> Array:
-    """Return the matrix of a rotation in the plane of x and the height."""
+    """Return the matrix of a rotation in the plane of the first and the last axis."""
     c, s = np.cos(angle), np.sin(angle)
     found = np.eye(d)
     found[0, 0], found[0, -1], found[-1, 0], found[-1, -1] = c, -s, s, c
@@ -201,15 +201,15 @@ def turn(d: int, angle: float) -> Array:
 
 
 class SlidingSetup(FiniteSetup):
-    """Mesh, forms, conditions and constants of a scene."""
+    """Mesh, forms, conditions and constants of a scene of two bodies."""
 
     LEVELS = (*FiniteSetup.LEVELS, "spin")
 
     def __init__(self, scene: Scene, comm: MPI.Comm, *, bulk: Any = None) -> None:
-        """Create it, with the arguments of `FiniteSetup`. Collective."""
+        """Create mesh, forms, conditions and constants, as `FiniteSetup` does. Collective."""
         super().__init__(scene, comm, bulk=bulk)
         self._moved_bodies: list[tuple[int, Any]] = []
-        if scene["drive"] == "prescribed":  # rotations need functions
+        if scene["drive"] == "prescribed":  # rotations vary in space
             self.bcs = list(self.unrelated_bcs)
             for body, side, *_ in scene["dirichlet"]:
                 value = fem.Function(self.V)
@@ -219,7 +219,7 @@ class SlidingSetup(FiniteSetup):
                 self._moved_bodies.append((body, value))
 
     def apply(self, stage: int, t: float) -> None:
-        """Set all loads."""
+        """Set loads and Dirichlet values at a load parameter of a stage."""
         scene, d, now = self.scene, self.d, self.load_levels(stage, t)
         slab, block = scene["bodies"][:2]
         direction = np.zeros(d)

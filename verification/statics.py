@@ -18,7 +18,7 @@ BASE, TOP, LEFT, RIGHT, SEAT = 1, 2, 3, 4, 5
 
 
 def block(n: tuple[int, int], size: tuple[float, float] = (1.0, 1.0), **kwargs):
-    """Create a rectangle with tagged sides."""
+    """Mesh a rectangle with tagged sides."""
     axes = [[np.linspace(0, length, k + 1) for k, length in zip(n, size, strict=True)]]
     sides = {BASE: near(1, 0), TOP: near(1, size[1]), LEFT: near(0, 0), RIGHT: near(0, size[0])}
     return boxes(axes, sides, **kwargs)
@@ -217,7 +217,7 @@ def incline() -> Outcome:
 def homogeneity() -> Outcome:
     """Load a block on a plane without gap proportionally, with open, stick and slip zones.
 
-    Twice the load gives twice the displacements, and four increments give those of one.
+    Twice the load gives twice the displacements; four increments give the same result as one.
     """
     rows = []
     source = "homogeneous of degree one"
@@ -265,7 +265,7 @@ def _sheared(made: Any, method: str, load: float, steps: int) -> tuple[np.ndarra
 
 
 def _norm(x: np.ndarray) -> float:
-    """Return the norm over all ranks."""
+    """Return the Euclidean norm over all ranks."""
     return float(np.sqrt(COMM.allreduce(x @ x)))
 
 
@@ -277,7 +277,7 @@ def _norm(x: np.ndarray) -> float:
 def patch() -> Outcome:
     """Compress two confined blocks by 0.01: pressure and jump are uniform."""
     rows, k_n = [], 1e7
-    solved = []  # with the pressure of exact contact
+    solved = []  # problem, stress, and pressure of exact contact
     for nu in (0.0, 0.3):
         axes = [
             [np.linspace(0, 1, 4), np.linspace(0, 0.5, 3)],

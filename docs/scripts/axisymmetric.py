@@ -1,4 +1,4 @@
-"""A round bar is pressed on a rigid floor: axisymmetric, the floor bears the load."""
+"""A round bar is pressed on a rigid floor, axisymmetric: the contact force is the load."""
 
 import numpy as np
 import ufl

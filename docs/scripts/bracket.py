@@ -1,4 +1,4 @@
-"""A ball is pressed on a bracket meshed by gmsh: a part in space, its tags and its pictures."""
+"""A ball is pressed on a bracket meshed by gmsh: a part in 3D, its tags and its pictures."""
 
 import logging
 from pathlib import Path
@@ -39,7 +39,7 @@ if MPI.COMM_WORLD.rank == 0:
         gmsh.model.addPhysicalGroup(dim, entities, tag)
 
     def cell_size(dim, tag, x, y, z, size):
-        """Of a/2 up to 2 a away from below the ball, growing from there on."""
+        """Return a/2 up to 2 a from the point below the ball, growing beyond that."""
         away = np.linalg.norm([x - AT, y - WIDTH / 2, z - THICK])
         return min(4.0, a / 2 + max(0.0, away - 2 * a) / 3)
 
@@ -72,7 +72,7 @@ fc.plotting.plot_deformation("output/bracket.png", u, stress=body.stress, magnif
 fc.plotting.plot_pressure("output/pressure.png", contact, near=2 * a)
 fc.Writer("output", problem, stress=body.stress).write(step)
 
-# The arm turns away below the ball, so that all points slip: friction is μ N.
+# The arm rotates below the ball, so that all points slip: friction is μ N.
 found = contact.resultants()
 assert np.isclose(found.force[2], -FORCE, rtol=1e-6)
 assert found.stick == 0 and np.isclose(found.tangential_force, 0.2 * found.normal_force)

@@ -11,13 +11,13 @@ LENGTH, CONDUCTIVITY = {"hot": 0.03, "cold": 0.05}, {"hot": 50.0, "cold": 15.0} 
 T_HOT, T_COLD = 400.0, 300.0  # K
 E, PRESSURE, H_PER_PRESSURE = 2e11, 5e6, 4e-4  # Pa, Pa, W/(m² K) per Pa
 WIDTH, LOW, HIGH = 0.01, 1, 2
-ANGLE = np.pi / 6  # of the bars: the interface has any direction
+ANGLE = np.pi / 6  # of the bars: the interface may have any direction
 AXIS = np.array([-np.sin(ANGLE), np.cos(ANGLE)])
 
 
 # begin bodies
 def bar(low: float, high: float, cells: tuple[int, int]):
-    """A bar between two heights along its axis; mesh and tags of its ends."""
+    """Return the mesh of a bar between two heights along its axis, and the tags of its ends."""
     msh = mesh.create_rectangle(MPI.COMM_WORLD, [(0, low), (WIDTH, high)], cells)
     facets = mesh.locate_entities_boundary(msh, 1, lambda x: np.isfinite(x[0]))
     y = mesh.compute_midpoints(msh, 1, facets)[:, 1]

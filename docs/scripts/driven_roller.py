@@ -52,7 +52,7 @@ roller = fc.Cylinder(
     (0, RADIUS),
     RADIUS,
     displacement=fc.Motion(force=(None, press), displacement=(way, None)),
-    rotation=fc.Rotation(None, about=(0, RADIUS), moment=moment),  # the angle follows
+    rotation=fc.Rotation(None, about=(0, RADIUS), moment=moment),  # the angle is unknown
 )
 surface = fc.ContactSurface(msh, tags, TOP)
 law = fc.Coulomb(FRICTION)
@@ -60,14 +60,14 @@ law = fc.Coulomb(FRICTION)
 
 # begin rolling
 def creepage(traction: float) -> tuple[float, fc.Contact]:
-    """Roll with a moment of traction μ P R; the last creepage, and the contact then."""
+    """Roll with a moment of traction μ P R; return the final creepage and the contact."""
     u.x.array[:] = press.value = way.value = moment.value = 0.0
     contact = fc.Contact(u, surface, roller, law, kinematics="finite")
     problem = fc.ContactProblem(body.residual(v), u, bcs=bcs, contacts=[contact])
     list(fc.increments(problem, press, 0, -FORCE))
 
     def load(rolled):
-        """Raise the moment along the first third."""
+        """Increase the moment along the first third of the path."""
         way.value = rolled
         moment.value = -traction * FRICTION * FORCE * RADIUS * min(1.0, 3 * rolled / ROLLED)
 

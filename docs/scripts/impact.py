@@ -1,4 +1,4 @@
-"""A bar hits a wall: inertia by Newmark's method in the form, the force is that of a wave."""
+"""A bar hits a wall: Newmark's method is in the form, and the force is that of a wave."""
 
 import numpy as np
 import ufl
@@ -43,7 +43,7 @@ for _ in times:
     velocity.x.array[:] += t * ((1 - GAMMA) * a + GAMMA * acceleration.x.array)
     before.x.array[:] = u.x.array
 # begin compare
-wave = DENSITY * celerity * SPEED * WIDTH  # until the wave is back from the free end
+wave = DENSITY * celerity * SPEED * WIDTH  # until the wave returns from the free end
 while_there = np.array(forces)[(times > 0.4) & (times < 1.6)]
 impulse = np.sum(forces) * float(dt.value) / (2 * DENSITY * WIDTH * SPEED)
 print(f"force {while_there.mean():.4g}, of a wave {wave:.4g}; impulse / 2 m v = {impulse:.3f}")

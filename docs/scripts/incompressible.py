@@ -1,4 +1,4 @@
-"""Rubber that keeps its volume, pressed between smooth plates: force and volume by closed form."""
+"""Incompressible rubber is pressed between smooth plates: the force has a closed form."""
 
 import numpy as np
 import ufl
@@ -39,7 +39,7 @@ contact = fc.Contact(
 )
 problem = fc.ContactProblem(F, w, bcs=bcs, contacts=[contact])
 list(fc.increments(problem, depth, 0, PRESSED, steps=4))
-# The block is as much longer as it is lower; ν = 1/2 means G = E/3.
+# At constant volume the length grows by 1 / low; ν = 1/2 means G = E/3.
 low, force = 1 - PRESSED, contact.resultants().normal_force
 expected = E / 3 * (1 / low**3 - low)
 print(f"force {force:.6g} N/mm, closed form {expected:.6g} N/mm")

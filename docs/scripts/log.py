@@ -1,4 +1,4 @@
-"""The log on the screen and in a file, of a block too stiffly held for the method chosen."""
+"""The log is written to screen and file, for a contact too stiff for the chosen method."""
 
 import logging
 import sys
@@ -41,7 +41,7 @@ bcs = [fem.dirichletbc(push, top, V.sub(0))]
 floor, law = (
     fc.HalfSpace((0, 0), (0, 1)),
     fc.Coulomb(0.3, k_n=fc.RelativeStiffness(1e4)),
-)  # too stiff
+)  # too stiff for L-BFGS
 contact = fc.Contact(u, fc.ContactSurface(msh, tags, 1), floor, law)
 problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method="lbfgs")
 for step in fc.increments(problem, push, 0, 1e-4, steps=2):

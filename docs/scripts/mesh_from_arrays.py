@@ -1,4 +1,4 @@
-"""A mesh that another program made: from an Abaqus file, from arrays and from XDMF."""
+"""A mesh of another program is read from an Abaqus file, from arrays and from XDMF."""
 
 from pathlib import Path
 
@@ -43,7 +43,7 @@ INP = """*NODE
 
 # begin meshio
 def read_abaqus(path):
-    """Points, cells, cell tags and node sets of quadrilaterals in the plane."""
+    """Return points, cells, cell tags and node sets of quadrilaterals in 2D."""
     read = meshio.read(path)
     sets = {SOFT: read.cell_sets["SOFT"], STIFF: read.cell_sets["STIFF"]}
     cells, tags = [], []
@@ -61,7 +61,7 @@ EDGES = np.array([[0, 1], [1, 2], [2, 3], [3, 0]])  # of a quadrilateral in the 
 
 
 def boundary_facets(cells, nodes):
-    """Exterior facets all of whose vertices are in a set of nodes."""
+    """Return the exterior facets all of whose vertices are in a set of nodes."""
     facets = np.sort(cells[:, EDGES].reshape(-1, 2), axis=1)
     facets, count = np.unique(facets, axis=0, return_counts=True)
     return facets[(count == 1) & np.isin(facets, nodes).all(axis=1)]

@@ -1,4 +1,4 @@
-"""A crowned roller, told to the package in three ways, is pressed on a block."""
+"""A crowned roller, defined by three kinds of obstacle, is pressed on a block."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ Path("output").mkdir(exist_ok=True)
 
 # begin distance
 def to_roller(x):
-    """Signed distance, positive outside: its gradient has length 1."""
+    """Return the signed distance, positive outside, whose gradient has length 1."""
     off = ufl.sqrt(x[0] ** 2 + (x[2] - RADIUS) ** 2)  # from the axis
     return ufl.sqrt((off + CROWN - RADIUS) ** 2 + x[1] ** 2) - CROWN
 
@@ -30,7 +30,7 @@ axle = ((0, 0, RADIUS), (0, 1, 0))
 
 # begin file
 def write_stl(path, size):
-    """The roller as another program leaves it: triangles of a size."""
+    """Write the roller as triangles of a size, as other programs do."""
     gmsh.initialize()
     gmsh.option.setNumber("General.Terminal", 0)
     occ = gmsh.model.occ
@@ -40,7 +40,7 @@ def write_stl(path, size):
     lines.insert(1, occ.addCircleArc(b, middle, c))
     section = occ.addPlaneSurface([occ.addCurveLoop(lines)])
     occ.revolve([(2, section)], 0, 0, RADIUS, 0, 1, 0, 2 * np.pi)
-    occ.remove([(2, section)])  # it is within the roller, and no part of its surface
+    occ.remove([(2, section)])  # it is inside of the roller, not part of its surface
     occ.synchronize()
     gmsh.option.setNumber("Mesh.MeshSizeMax", size)
     gmsh.model.mesh.generate(2)

@@ -1,4 +1,4 @@
-"""Friction that grows with the slip distance: a block dragged along a floor, by closed form."""
+"""A block is dragged along a floor with slip-strengthening friction, against a closed form."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,14 +13,14 @@ import fenics_contact as fc
 
 @dataclass(frozen=True)
 class Strengthening(fc.Coulomb):
-    """A friction coefficient μ + a |Δu_t|, by the slip distance of the increment."""
+    """A friction coefficient μ + a |Δu_t| that depends on the slip distance of the increment."""
 
     rate: Any = 0.0  # a, 1/mm
 
     def friction_bound(self, kinematics, pressure, parameters):
-        """Size of the yield surface (stress)."""
+        """Return the size of the yield surface (stress)."""
         slip = kinematics.tangential_increment
-        distance = ufl.sqrt(ufl.dot(slip, slip) + 1e-16)  # a root has no derivative at 0
+        distance = ufl.sqrt(ufl.dot(slip, slip) + 1e-16)  # the root has no derivative at 0
         return (parameters["friction"] + parameters["rate"] * distance) * pressure
 
 

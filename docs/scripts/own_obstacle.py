@@ -1,4 +1,4 @@
-"""A class of obstacles: a rigid ring of round section is pressed on a block."""
+"""A user-defined obstacle, a rigid ring of round section, is pressed on a block."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,11 +24,11 @@ class Torus(fc.Obstacle):
 
     @property
     def smallest_radius(self):
-        """More quadrature points are chosen where facets are long relative to this (length)."""
+        """Facets that are long relative to this length get more quadrature points."""
         return self.section
 
     def place(self, x, to_ufl):
-        """Signed distance from the torus at x, and the direction to it."""
+        """Return the signed distance from the torus at x, and the direction to it."""
         arm = x - to_ufl(np.asarray(self.center, dtype=float))
         rho = ufl.sqrt(arm[0] ** 2 + arm[1] ** 2)
         nearest = to_ufl(self.ring) / rho  # times (arm_x, arm_y): on the circle
@@ -47,7 +47,7 @@ V = fem.functionspace(msh, ("Lagrange", 1, (3,)))
 
 
 def press(obstacle, push):
-    """Force on the block when the ring is moved up into it."""
+    """Return the force on the block after the ring is moved up into it."""
     push(0.0)
     u, v = fem.Function(V), ufl.TestFunction(V)
     F = fc.elasticity.LinearElastic(u, E, NU, "3D").residual(v)
@@ -70,7 +70,7 @@ def set_way(depth):
 
 
 def to_torus(x):
-    """The same shape as a signed distance."""
+    """Return the signed distance of the torus."""
     rho = ufl.sqrt(x[0] ** 2 + x[1] ** 2)
     return ufl.sqrt((rho - RING) ** 2 + (x[2] + SECTION) ** 2) - SECTION
 

@@ -1,4 +1,4 @@
-"""Where the contact ends inside a facet: quadrature on Γc against a closed form.
+"""A contact ends inside a facet: quadrature on Γc against a closed form.
 
 python docs/scripts/quadrature.py             # two degrees
 python docs/scripts/quadrature.py 2 4 8 16 32    # these degrees
@@ -20,7 +20,7 @@ DEGREES = [int(word) for word in sys.argv[1:]] or [2, 16]
 
 # begin block
 def footing(cells: int, degree: int, eccentricity: float) -> float:
-    """Largest pressure below a nearly rigid block with an eccentric load."""
+    """Return the largest pressure below a nearly rigid block with an eccentric load."""
     msh = mesh.create_rectangle(
         MPI.COMM_WORLD, [(0, 0), (WIDTH, 0.5)], (cells, 2), mesh.CellType.quadrilateral
     )

@@ -21,7 +21,7 @@ BETA = (GAMMA + 0.5) ** 2 / 4
 
 # begin form
 def impact(modulus: float, cells: int, law: fc.Law, dt: float, steps: int):
-    """Force at every step, and kinetic, elastic energy and momentum after it; relative ones."""
+    """Return force, and relative kinetic energy, elastic energy and momentum at every step."""
     n = (1, cells)
     msh = mesh.create_rectangle(
         MPI.COMM_WORLD, [(0, 0), (WIDTH, LENGTH)], n, mesh.CellType.quadrilateral

@@ -18,7 +18,7 @@ FOOT, RIM = 1, 2
 # begin section
 gmsh.initialize()
 gmsh.option.setNumber("General.Terminal", 0)
-if MPI.COMM_WORLD.rank == 0:  # half a disc on its foot
+if MPI.COMM_WORLD.rank == 0:  # half a disc on its flat side
     occ = gmsh.model.occ
     disc, box = occ.addDisk(0, 0, 0, RADIUS, RADIUS), occ.addRectangle(-9, 0, 0, 18, 9)
     ((_, section),), _ = occ.intersect([(2, disc)], [(2, box)])
@@ -79,5 +79,5 @@ grown = mesh.comm.allreduce(fem.assemble_scalar(volume)) / (np.pi * RADIUS**2 / 
 if mesh.comm.rank == 0:
     print(f"work {work:.4f} mJ/mm, stored {stored:.4f}, taken by friction {taken:.4f}")
     print(f"volume has grown by {grown:.1e}")
-assert np.isclose(work, stored + taken, rtol=1e-2)  # trapezia
+assert np.isclose(work, stored + taken, rtol=1e-2)  # trapezoidal rule
 assert abs(grown) < 1e-6

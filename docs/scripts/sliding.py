@@ -1,4 +1,4 @@
-"""A pad of plastic on a plate of steel that slides to and fro: the loop of friction over way."""
+"""A plastic pad on a steel plate in cyclic sliding: the hysteresis loop of the friction force."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ BELOW, ABOVE = 1, 2
 
 # begin bodies
 def block(low, high, cells):
-    """A rectangle between two corners, its mesh and tags."""
+    """Return mesh and facet tags of a rectangle between two corners."""
     msh = mesh.create_rectangle(MPI.COMM_WORLD, [low, high], cells)
     facets = mesh.locate_entities_boundary(msh, 1, lambda x: np.isfinite(x[0]))
     y = mesh.compute_midpoints(msh, 1, facets)[:, 1]
@@ -56,7 +56,7 @@ for start, end in ((0, WAY), (WAY, -WAY), (-WAY, WAY)):
         taken += step.energy.dissipation if start != 0 else 0.0  # in the cycle
 
 # begin picture
-loop = slice(10, None)  # from the first turn on
+loop = slice(10, None)  # from the first load reversal on
 area = np.trapezoid(forces[loop], ways[loop])
 Path("output").mkdir(exist_ok=True)
 if joined.mesh.comm.rank == 0:
@@ -69,4 +69,4 @@ if joined.mesh.comm.rank == 0:
 
 limit = FRICTION * PRESSURE * WIDTH
 assert np.isclose(forces[10], limit, rtol=1e-6) and np.isclose(forces[-1], limit, rtol=1e-6)
-assert np.isclose(area, taken, rtol=1e-2)  # trapezia
+assert np.isclose(area, taken, rtol=1e-2)  # trapezoidal rule

@@ -7,7 +7,7 @@ from spack_repo.builtin.build_systems.python import PythonPackage
 class PyFenicsContact(PythonPackage):
     """Frictional contact for FEniCSx as a UFL boundary form."""
 
-    # This checkout; in Spack's own repository `url` and, for each version, the sha256 of its sdist.
+    # This checkout; Spack's repository requires `url` and, per version, the sha256 of the sdist.
     git = Path(__file__).resolve().parents[5].as_uri()
 
     license("LGPL-3.0-or-later")
@@ -28,7 +28,7 @@ class PyFenicsContact(PythonPackage):
         depends_on("py-numpy")
         depends_on("py-scipy")
 
-    # Contact is an inequality: of complex numbers there is none. MUMPS factorises on several ranks.
+    # Contact is an inequality, which complex numbers do not have. MUMPS supports several ranks.
     depends_on("petsc~complex+mumps")
 
     with when("+demo"), default_args(type="run"):
