@@ -13,7 +13,7 @@ from functools import partial
 
 import fenics_contact as fc
 from benchmarks.timing import parser, write
-from scenes.indented import half_block, press
+from scenes.indented_block import half_block, solve_indentation
 
 
 def main() -> None:
@@ -25,7 +25,7 @@ def main() -> None:
             if arguments.short:
                 levels -= 2
             steps = 4 if friction else 1
-            solve = partial(press, friction=friction, steps=steps)
+            solve = partial(solve_indentation, friction=friction, steps=steps)
             for level in fc.adapt(*half_block(4), solve, levels=levels, share=share):
                 row = {"μ": friction, "refinement": refinement, "dofs": level.dofs}
                 row["error of the energy norm"] = level.budget.energy

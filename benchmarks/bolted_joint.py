@@ -27,9 +27,9 @@ from mpi4py import MPI
 import fenics_contact as fc
 from benchmarks import costs, timing
 from scenes import bolted_joint as joint
-from scenes.elasticity import hold, residual
-from scenes.problems import count
-from scenes.processes import answer
+from scenes.elasticity import dirichlet_bc, residual
+from scenes.problems import n_dofs
+from scenes.processes import run_json
 
 COMM = MPI.COMM_WORLD
 TIGHT, PULLED = 1.0, 3.0  # load parameter at the end of preload and pull
@@ -43,8 +43,8 @@ def linear(made: joint.BoltedJoint, repeat: int) -> float:
     u = made.u.copy()
     v = ufl.TestFunction(u.function_space)
     F = residual(u, v, joint.E, joint.NU) - v[0] * ufl.dx
-    held = (joint.HELD, joint.OVER, joint.RING, joint.NUT_RING)
-    bcs = [hold(u, made.tags, tag, i) for tag in held for i in range(3)]
+    held = (joint.FIXED, joint.UPPER_PLATE, joint.HEAD_FACE, joint.NUT_FACE)
+    bcs = [dirichlet_bc(u, made.tags, tag, i) for tag in held for i in range(3)]
     times = []
     for _ in range(repeat + 1):
         start = _now()
@@ -64,7 +64,7 @@ def child(size: float, degree: int, repeat: int) -> None:
         pass  # compiles the forms
     made = joint.BoltedJoint(size, degree=degree)
     unit = linear(made, repeat)
-    common = {"dofs": count(made.u.function_space), "ranks": COMM.size}
+    common = {"dofs": n_dofs(made.u.function_space), "ranks": COMM.size}
     rows: list[Row] = []
     start = _now()
     for step in made.increments(PULLED, steps=round(PULLED / INCREMENT)):
@@ -108,7 +108,7 @@ def main() -> None:
     for size in [5.0] if arguments.short else arguments.size:
         for ranks in arguments.ranks:
             words = ["--child", "--size", size, "--degree", degree, "--repeat", arguments.repeat]
-            rows += answer(ranks, Path(__file__).resolve(), *words)
+            rows += run_json(ranks, Path(__file__).resolve(), *words)
             print(f"cells of {size:g} mm, {ranks} ranks: done", flush=True)
     title = f"Bolted joint, tetrahedra of degree {degree}, μ = {joint.FRICTION:g}"
     timing.write(arguments.output, "bolted_joint", title, rows)

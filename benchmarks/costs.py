@@ -24,7 +24,7 @@ from benchmarks import timing
 from fenics_contact.surface.surface import PointEvaluator
 from fenics_contact.systems import linear
 from scenes import problems
-from scenes.elasticity import hold
+from scenes.elasticity import dirichlet_bc
 
 YARDSTICK = "one linear solve"
 # Suffix of the names of histories with ``recover_interior="last"``.
@@ -52,24 +52,24 @@ class Case:
             "u", "peak" and "force"; none by default.
     """
 
-    body: problems.Body
+    body: problems.ContactScene
     degree: int
     stiffness: float
     errors: Callable[[float, int, Row], Row] = lambda friction, steps, results: {}
 
     @cached_property
     def _space(self) -> fem.FunctionSpace:
-        return problems.parts(self.body, self.degree)[0].function_space
+        return problems.elasticity_problem(self.body, self.degree)[0].function_space
 
     @property
     def n_dofs(self) -> int:
         """Number of dofs."""
-        return problems.count(self._space)
+        return problems.n_dofs(self._space)
 
     @property
     def n_contact_dofs(self) -> int:
         """Number of dofs on Γc. Collective."""
-        return problems.count_on(self._space, self.body.tags.find(self.body.surface))
+        return problems.n_facet_dofs(self._space, self.body.tags.find(self.body.surface))
 
     def linear(self, kind: str = "direct") -> Row:
         """Solve the body once, without contact, by `linear_solve`."""
@@ -78,18 +78,18 @@ class Case:
     def plain(self, friction: float, kind: str = "direct") -> Row:
         """Solve a hand-written penalty form in one increment by `newton`."""
         body = replace(self.body, friction=friction)
-        u, F, load, bcs = problems.parts(body, self.degree)
-        load.value = body.end
-        pressure, traction = problems.penalty(body, u, load, self.stiffness)
+        u, F, load, bcs = problems.elasticity_problem(body, self.degree)
+        load.value = body.final_load
+        pressure, traction = problems.reference_penalty_traction(body, u, load, self.stiffness)
         # The quadrature of the package, so that the results agree to all digits.
         points = {"quadrature_degree": 2 * self.degree}
         ds = ufl.Measure("ds", body.mesh, subdomain_data=body.tags, metadata=points)(body.surface)
         F -= ufl.dot(traction, ufl.TestFunction(u.function_space)) * ds
-        if body.push:
-            for i, value in enumerate(body.push):
+        if body.initial_displacement:
+            for i, value in enumerate(body.initial_displacement):
                 u.x.array[i :: len(u)] = value
         fem.set_bc(u.x.array, bcs)
-        row = newton(F, u, bcs, body.force / self.n_contact_dofs**0.5, kind)
+        row = newton(F, u, bcs, body.force_scale / self.n_contact_dofs**0.5, kind)
         if row["iterations"] == "none":
             return row
         force = fem.assemble_scalar(fem.form(pressure * ds))
@@ -106,7 +106,13 @@ class Case:
         try:
             made = list(
                 fc.increments(
-                    problem, load, 0.0, body.end, steps=steps, recover_interior=field, max_cuts=0
+                    problem,
+                    load,
+                    0.0,
+                    body.final_load,
+                    steps=steps,
+                    recover_interior=field,
+                    max_cuts=0,
                 )
             )
         except fc.NotConverged:
@@ -126,7 +132,7 @@ class Case:
         return row | results | self.errors(friction, steps, results)
 
 
-def linear_solve(body: problems.Body, degree: int, kind: str = "direct") -> Row:
+def linear_solve(body: problems.ContactScene, degree: int, kind: str = "direct") -> Row:
     """Assemble and solve a body with Γc fixed or loaded: the unit of time. Collective.
 
     Args:
@@ -135,11 +141,15 @@ def linear_solve(body: problems.Body, degree: int, kind: str = "direct") -> Row:
         kind: "direct": MUMPS' Cholesky factorisation, half the operations of LU; "multigrid":
             conjugate gradients with GAMG, to `TOLERANCE`.
     """
-    u, residual, load, bcs = problems.parts(body, degree)
-    load.value = body.end
-    if body.pressed:
-        residual -= body.pressed(ufl.TestFunction(u.function_space), body.ds)
-    bcs += [hold(u, body.tags, tag, i) for tag in body.glued for i in range(len(u))]
+    u, residual, load, bcs = problems.elasticity_problem(body, degree)
+    load.value = body.final_load
+    if body.linear_solve_load_work:
+        residual -= body.linear_solve_load_work(ufl.TestFunction(u.function_space), body.ds)
+    bcs += [
+        dirichlet_bc(u, body.tags, tag, i)
+        for tag in body.linear_solve_fixed_facets
+        for i in range(len(u))
+    ]
     return solve_once(u, residual, bcs, kind)
 
 

@@ -30,7 +30,7 @@ from benchmarks import timing
 from fenics_contact.surface.surface import PointEvaluator
 from fenics_contact.types import Array
 from scenes import problems
-from scenes.problems import Body
+from scenes.problems import ContactScene
 
 PENALTIES = (1.0, 10.0, 100.0, 1e3, 1e4, 1e6)
 NITSCHE = {
@@ -71,11 +71,13 @@ class Found:
         return row | {"penetration": self.penetration, "iterations": self.iterations}
 
 
-def by_package(body: Body, stiffness: float, enforcement: str, tolerance: float = 1e-5) -> Found:
+def by_package(
+    body: ContactScene, stiffness: float, enforcement: str, tolerance: float = 1e-5
+) -> Found:
     """Solve by the penalty or the augmented Lagrangian method of the package."""
     choices = {"enforcement": enforcement, "tolerance": tolerance}
-    problem, contact, u, load = problems.problem(body, 2, stiffness, choices=choices)
-    load.value = body.end
+    problem, contact, u, load = problems.problem(body, 2, stiffness, contact_options=choices)
+    load.value = body.final_load
     step = problem.solve()
     shear = contact.tangential_traction[:, 0]
     return Found(
@@ -93,15 +95,15 @@ class NewtonFailed(RuntimeError):
     """The hand-written Newton method did not converge."""
 
 
-def by_nitsche(body: Body, factor: float, share: float) -> Found:
+def by_nitsche(body: ContactScene, factor: float, share: float) -> Found:
     """Solve by Nitsche's method for frictional contact (Chouly, Hild), γ = ``factor`` E/h.
 
     ∫ σ(u):ε(v) - θ ∫ σ(u)n·σ(v)n/γ + ∫ P(σ(u)n - γ jump)·(θ σ(v)n/γ - v) over Γc, where
     P projects onto pressures and tractions within the friction cone; θ = ``share``, and θ = 1 is
     symmetric without friction.
     """
-    u, F, load, bcs = problems.parts(body, 2)
-    load.value = body.end
+    u, F, load, bcs = problems.elasticity_problem(body, 2)
+    load.value = body.final_load
     V = u.function_space
     v = ufl.TestFunction(V)
     gamma = factor * body.E / body.h
@@ -137,7 +139,7 @@ def by_nitsche(body: Body, factor: float, share: float) -> Found:
     if symmetric:
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
     ksp.getPC().setFactorSolverType("mumps")
-    u.x.array.reshape(-1, 2)[:] = body.push
+    u.x.array.reshape(-1, 2)[:] = body.initial_displacement
     fem.set_bc(u.x.array, bcs)
     step = u.x.petsc_vec.duplicate()
     size, iterations = 0.0, 0
@@ -168,7 +170,7 @@ def by_nitsche(body: Body, factor: float, share: float) -> Found:
     )
 
 
-def methods(make: Callable[[], Body]) -> dict[str, Callable[[], Found]]:
+def methods(make: Callable[[], ContactScene]) -> dict[str, Callable[[], Found]]:
     """Return the methods to compare, by name."""
     found: dict[str, Callable[[], Found]] = {
         f"penalty {k:g}": lambda k=k: by_package(make(), k, "penalty") for k in PENALTIES
@@ -179,7 +181,12 @@ def methods(make: Callable[[], Body]) -> dict[str, Callable[[], Found]]:
 
 
 def compare(
-    name: str, make: Callable[[Any], Body], size: float, finer: float, folder: Path, repeat: int
+    name: str,
+    make: Callable[[Any], ContactScene],
+    size: float,
+    finer: float,
+    folder: Path,
+    repeat: int,
 ) -> None:
     """Solve one problem by all methods, and write its table."""
     reference = by_package(make(finer), 10.0, "augmented", tolerance=1e-8)
@@ -198,7 +205,7 @@ def compare(
     make(size)
     rows = timing.measure(runs, repeat=repeat, first=first, once=ONCE)
     rows = timing.in_units_of(rows, YARDSTICK, "time / penalty 10")
-    dofs = problems.count(problems.parts(make(size), 2)[0].function_space)
+    dofs = problems.n_dofs(problems.elasticity_problem(make(size), 2)[0].function_space)
     note = f"Reference: displacement {reference.displacement:.9g}, peak pressure "
     note += f"{reference.pressure.max():.7g}, friction force {reference.shear:.7g}."
     stem = name.lower().replace(" ", "_").replace("=", "").replace("μ", "mu").replace(".", "")

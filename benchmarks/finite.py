@@ -4,11 +4,12 @@
 
 Two problems: a block 16 x 10 of neo-Hookean rubber under a rigid disc of radius 4 that is pressed
 in by 3, rotated by 0.8 and slid by 2 (demos/rolling.py); and a rubber block that is pressed on
-another one and slid along it by four fifths of its length (scenes/rubbed.py). Each history is
-solved three times: with contact; without contact, with the computed displacements of Γc (and of the
-opposing surface) as Dirichlet conditions, by the same solver in the same increments; and the latter
-by SNES on the form in plain DOLFINx. All have the same solutions; the last two measure the bulk:
-Newton iterations, factorisations, and CPU time of all increments (median of ``--repeat``).
+another one and slid along it by four fifths of its length (scenes/sliding_rubber_block.py). Each
+history is solved three times: with contact; without contact, with the computed displacements of Γc
+(and of the opposing surface) as Dirichlet conditions, by the same solver in the same increments;
+and the latter by SNES on the form in plain DOLFINx. All have the same solutions; the last two
+measure the bulk: Newton iterations, factorisations, and CPU time of all increments (median of
+``--repeat``).
 
 Newton iterations are given relative to both. The package needs fewer for the bulk: it follows
 prescribed values by a step with the last factored tangent before Newton's method starts; in plain
@@ -33,7 +34,7 @@ import fenics_contact as fc
 from benchmarks import costs, timing
 from fenics_contact.elasticity import NeoHookean
 from fenics_contact.types import Array
-from scenes import rubbed
+from scenes import sliding_rubber_block
 from scenes.blocks import BOTTOM, LEFT, TOP, block_mesh
 
 PRESSED, MORE = 12, 8  # increments of indentation, and of rotation and sliding each
@@ -85,21 +86,26 @@ class UnderADisc:
         surface = fc.ContactSurface(mesh, self.tags, TOP)
         self.contact = fc.Contact(self.u, surface, disc, law, kinematics="finite")
 
-    def lead(self, side: float, depth: float, turn: float) -> None:
+    def set_top_displacement(self, side: float, depth: float, turn: float) -> None:
         """Move the disc sideways and down, and rotate it."""
         self._shift.value[:], self._angle.value = (side, -depth), turn
 
 
-class OneOnAnother(rubbed.Rubbed):
+class OneOnAnother(sliding_rubber_block.SlidingRubberBlock):
     """Two rubber blocks, with the attributes of `UnderADisc`."""
 
-    path = rubbed.PATH
+    path = sliding_rubber_block.PATH
     parts: Mapping[str, slice] = {
-        "indentation": slice(rubbed.PRESSED),
-        "sliding": slice(rubbed.PRESSED, None),
+        "indentation": slice(sliding_rubber_block.N_PRESSING),
+        "sliding": slice(sliding_rubber_block.N_PRESSING, None),
     }
-    held = (rubbed.BOTTOM, rubbed.TOP, rubbed.LOWER, rubbed.UPPER)
-    free = rubbed.SIDE
+    held = (
+        sliding_rubber_block.BOTTOM,
+        sliding_rubber_block.TOP,
+        sliding_rubber_block.LOWER,
+        sliding_rubber_block.UPPER,
+    )
+    free = sliding_rubber_block.SIDE
 
 
 Scene = Callable[[float, int], UnderADisc | OneOnAnother]
@@ -111,7 +117,7 @@ def with_contact(made: UnderADisc | OneOnAnother) -> tuple[timing.Row, list[Arra
     problem = fc.ContactProblem(made.residual, made.u, bcs=made.bcs, contacts=[made.contact])
     steps, states, start = [], [], time.process_time()
     for place in made.path:
-        made.lead(*place)
+        made.set_top_displacement(*place)
         steps.append(problem.solve())
         problem.commit()
         states.append(made.u.x.array.copy())

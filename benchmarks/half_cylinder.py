@@ -32,8 +32,8 @@ def one_increment(friction: float, h: float) -> dict[str, float]:
     """Return the augmented Lagrangian solution of one increment on quadratic cells of size h."""
     body = problems.half_cylinder(friction, h)
     choices = {"enforcement": "augmented", "tolerance": 1e-7}
-    problem, contact, u, load = problems.problem(body, 2, 10.0, choices=choices)
-    load.value = body.end
+    problem, contact, u, load = problems.problem(body, 2, 10.0, contact_options=choices)
+    load.value = body.final_load
     problem.solve()
     return {"u": body.displacement(u), "peak": contact.resultants().max_pressure}
 

@@ -34,7 +34,7 @@ from petsc4py import PETSc
 
 from benchmarks import costs, timing
 from scenes import problems
-from scenes.processes import answer
+from scenes.processes import run_json
 
 COMM = MPI.COMM_WORLD
 FRICTION = 0.3
@@ -134,7 +134,7 @@ def start(run: str, cells: int, ranks: int, repeat: int) -> dict[str, Any]:
     """Return the row of a run in new processes."""
     words = ["--child", run, "--cells", cells, "--repeat", repeat]
     try:
-        return answer(ranks, Path(__file__).resolve(), *words)
+        return run_json(ranks, Path(__file__).resolve(), *words)
     except subprocess.CalledProcessError:
         return {"run": run, "ranks": ranks, "iterations": "failed", "seconds": float("nan")}
 

@@ -28,8 +28,8 @@ import fenics_contact as fc
 from benchmarks import timing
 from demos import ironing
 from scenes import bodies, problems
-from scenes.elasticity import displacement_space, hold
-from scenes.tags import between, near, plane, sides
+from scenes.elasticity import dirichlet_bc, displacement_space
+from scenes.tags import at_coordinate, at_interface, plane, tag_by_nodes
 
 METHODS = ("lbfgs", "newton", "continuation", "alternating", "primal_dual")
 STIFFNESSES = (10.0, 1000.0)
@@ -45,7 +45,7 @@ def half_cylinder(method: str, stiffness: float) -> Loading:
     problem, _, _, pressure = problems.problem(body, 2, stiffness, method=method, fallback=False)
 
     def load(t: float) -> None:
-        pressure.value = body.end * t
+        pressure.value = body.final_load * t
 
     return problem, load, 10
 
@@ -77,7 +77,7 @@ def dragged_ball(method: str, stiffness: float) -> Loading:
     move = fem.Constant(mesh, np.zeros(3))
     ball = fc.Ball((0, 0, 2.0), 2.0, displacement=move)
     k = fc.RelativeStiffness(stiffness)
-    tags = sides(mesh, {1: plane(2, -1), 2: plane(2, 0)})
+    tags = tag_by_nodes(mesh, {1: plane(2, -1), 2: plane(2, 0)})
     problem = dragged(body, tags, (1, 2), ball, fc.Coulomb(0.3, k, k), method)
 
     def load(t: float) -> None:
@@ -96,7 +96,7 @@ def dragged(
 ) -> fc.ContactProblem:
     """Create the problem of a body clamped at one end and touched by an obstacle at the other."""
     u, (held, touched) = body.u, ends
-    bcs = [hold(u, tags, held, i) for i in range(len(u))]
+    bcs = [dirichlet_bc(u, tags, held, i) for i in range(len(u))]
     contact = fc.Contact(u, fc.ContactSurface(u.function_space.mesh, tags, touched), obstacle, law)
     F = body.residual(ufl.TestFunction(u.function_space))
     return fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method=method, fallback=False)
@@ -111,18 +111,18 @@ def dragged_block(
     upright = np.linspace(0, 0.5, n // 2 + 1), np.linspace(0.5, 1, m + 1)
     floor, lower, upper, top = 1, 2, 3, 4
     faces = {
-        floor: near(d - 1, 0.0),
-        lower: between(d - 1, 0.5, above=False),
-        upper: between(d - 1, 0.5, above=True),
-        top: near(d - 1, 1.0),
+        floor: at_coordinate(d - 1, 0.0),
+        lower: at_interface(d - 1, 0.5, above=False),
+        upper: at_interface(d - 1, 0.5, above=True),
+        top: at_coordinate(d - 1, 1.0),
     }
     axes = [[*sideways, up] for sideways, up in zip(across, upright, strict=True)]
     made = bodies.Bodies(bodies.boxes(axes, faces), 1000.0, 0.3, degree=4 - d)
     side, down = made.constant(), made.constant()
-    made.hold(floor, *range(d))
-    made.hold(top, 0, value=side)
-    made.hold(top, *range(1, d - 1))
-    made.hold(top, d - 1, value=down)
+    made.prescribe(floor, *range(d))
+    made.prescribe(top, 0, value=side)
+    made.prescribe(top, *range(1, d - 1))
+    made.prescribe(top, d - 1, value=down)
     k = fc.RelativeStiffness(stiffness)
     contact = made.contact(upper, lower, fc.Coulomb(0.3, k, k), kinematics="finite")
     problem = made.problem(contact, method=method, fallback=fallback)

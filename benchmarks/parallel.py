@@ -34,7 +34,7 @@ from mpi4py import MPI
 
 from benchmarks import large, timing
 from fenics_contact import plotting
-from scenes.processes import answer
+from scenes.processes import run_json
 from verification import report
 
 RUNS = ("linear, multigrid", "contact, multigrid", "contact, multigrid, Newton")
@@ -339,7 +339,7 @@ def measured(path: Path) -> list[Row]:
 
 def launch_machine() -> Machine:
     """Run `measure_machine` in two new processes."""
-    return Machine(**answer(2, Path(__file__).resolve(), "--machine"))
+    return Machine(**run_json(2, Path(__file__).resolve(), "--machine"))
 
 
 def write_tables(folder: Path, rows: list[Row], machine: Machine) -> None:

@@ -37,9 +37,9 @@ def solve(
     body = problems.half_cylinder(0.0, h)
     choices = {"enforcement": enforcement}
     problem, contact, _, load = problems.problem(
-        body, degree, stiffness, choices=choices, rule=rule
+        body, degree, stiffness, contact_options=choices, surface_options=rule
     )
-    load.value = body.end
+    load.value = body.final_load
     return contact, problem.solve()
 
 

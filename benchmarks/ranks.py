@@ -25,7 +25,7 @@ from mpi4py import MPI
 
 from benchmarks import costs, timing
 from scenes import problems
-from scenes.processes import answer
+from scenes.processes import run_json
 
 # k_n h/E = k_t h/E, and the degree of the displacement.
 STIFFNESS, DEGREE = 10.0, 2
@@ -61,7 +61,7 @@ def child(h: float, repeat: int) -> None:
 
 def start(h: float, ranks: int, repeat: int) -> list[Row]:
     """Return the rows of a mesh size, measured in new processes."""
-    return answer(ranks, Path(__file__).resolve(), "--child", "--h", h, "--repeat", repeat)
+    return run_json(ranks, Path(__file__).resolve(), "--child", "--h", h, "--repeat", repeat)
 
 
 def compared(rows: list[Row]) -> list[Row]:

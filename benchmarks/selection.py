@@ -37,10 +37,10 @@ from mpi4py import MPI
 import fenics_contact as fc
 from benchmarks import timing
 from fenics_contact.elasticity import LinearElastic, NeoHookean
-from scenes.elasticity import displacement_space, hold
-from scenes.problems import count
-from scenes.processes import answer
-from scenes.tags import sides
+from scenes.elasticity import dirichlet_bc, displacement_space
+from scenes.problems import n_dofs
+from scenes.processes import run_json
+from scenes.tags import tag_by_nodes
 from verification import report
 
 COMM = MPI.COMM_WORLD
@@ -141,7 +141,7 @@ def block(scene: Scene, number: int, dofs: float) -> tuple[dolfinx.mesh.Mesh, An
         BASE: lambda x: np.isclose(x[d - 1], high - scene.height),
         TOP: lambda x: np.isclose(x[d - 1], high) & (np.hypot(x[0], x[1] * (d > 2)) < reach),
     }
-    return mesh, None, sides(mesh, where)
+    return mesh, None, tag_by_nodes(mesh, where)
 
 
 def _by_gmsh(low: np.ndarray, size: np.ndarray, h: float) -> dolfinx.mesh.Mesh:
@@ -188,9 +188,9 @@ def make(scene: Scene, dofs: float) -> Made:
     joined = fc.join_meshes([block(scene, n, dofs / scene.bodies) for n in range(scene.bodies)])
     u = fem.Function(displacement_space(joined.mesh, scene.degree))
     d, last = len(u), scene.bodies - 1
-    bcs = [hold(u, joined.facets, joined.facet(last, BASE), i) for i in range(d)]
+    bcs = [dirichlet_bc(u, joined.facets, joined.facet(last, BASE), i) for i in range(d)]
     for body in range(last):  # friction need not constrain them
-        bcs += [hold(u, joined.facets, joined.facet(body, SIDE), i) for i in range(d - 1)]
+        bcs += [dirichlet_bc(u, joined.facets, joined.facet(body, SIDE), i) for i in range(d - 1)]
     down, along = (fem.Constant(joined.mesh, 0.0) for _ in range(2))
     return Made(u, joined, bcs, down, along)
 
@@ -239,7 +239,7 @@ def child(scene: Scene, way: str) -> None:
     try:
         solve(scene, make(replace(scene, generous=True), 300.0), WAYS[way])  # compiles the forms
         made = make(scene, float(scene.dofs))
-        row["dofs"] = count(made.u.function_space)
+        row["dofs"] = n_dofs(made.u.function_space)
         COMM.Barrier()
         start, before = time.perf_counter(), _memory("VmRSS")
         row["force"], row["iterations"] = solve(scene, made, WAYS[way])
@@ -263,7 +263,7 @@ def run(scene: Scene, seed: int, way: str, limit: float) -> timing.Row:
     """Run a configuration in a new process, which is terminated after ``limit`` (s)."""
     words = ["-m", "benchmarks.selection", "--child", way, json.dumps(asdict(scene))]
     try:
-        row = answer(scene.ranks, *words, seconds=limit)
+        row = run_json(scene.ranks, *words, seconds=limit)
     except subprocess.TimeoutExpired:
         row = {"outcome": "slow", "seconds": limit}
     except subprocess.CalledProcessError:

@@ -40,7 +40,7 @@ from benchmarks.trade_scenes import (
 )
 from fenics_contact.contact.accuracy import PRESETS
 from scenes import problems
-from scenes.problems import Body
+from scenes.problems import ContactScene
 from verification import report
 
 Row = timing.Row
@@ -55,9 +55,9 @@ LIMIT = 20.0
 # ---- one run -------------------------------------------------------------------------------------
 
 
-def solve(body: Body, setting: Setting, limit: float = LIMIT) -> Row:
+def solve(body: ContactScene, setting: Setting, limit: float = LIMIT) -> Row:
     """Solve the contact problem up to its full load; return the row without times."""
-    made = problems.parts(body, setting.degree)
+    made = problems.elasticity_problem(body, setting.degree)
     rule: dict[str, Any] = {}
     if setting.quadrature == "vertex":
         rule["quadrature_scheme"] = "vertex"
@@ -79,25 +79,27 @@ def solve(body: Body, setting: Setting, limit: float = LIMIT) -> Row:
         law = fc.Coulomb(body.friction, **stiffness)
     else:
         law = fc.Frictionless(**stiffness)
-    row: Row = {"dofs": problems.count(made[0].function_space)}
+    row: Row = {"dofs": problems.n_dofs(made[0].function_space)}
     steps: list[fc.Step] = []
     try:
         problem, contact, u, load = problems.problem(
             body,
             setting.degree,
             law,
-            made=made,
-            choices=choices,
-            rule=rule,
+            elasticity=made,
+            contact_options=choices,
+            surface_options=rule,
             method=None if setting.solver == "default" else setting.solver,
             petsc_options=options,
         )
-        wanted = None if setting.accuracy and body.history else setting.increments
+        wanted = None if setting.accuracy and body.is_path_dependent else setting.increments
         start = time.perf_counter()
-        for step in fc.increments(problem, load, 0.0, body.end, steps=wanted, max_cuts=2):
+        for step in fc.increments(problem, load, 0.0, body.final_load, steps=wanted, max_cuts=2):
             steps.append(step)
-            if limit and step.load != body.end and time.perf_counter() - start > limit:
-                raise TimeoutError(f"time limit of {limit:g} s, at {step.load / body.end:.0%}")
+            if limit and step.load != body.final_load and time.perf_counter() - start > limit:
+                raise TimeoutError(
+                    f"time limit of {limit:g} s, at {step.load / body.final_load:.0%}"
+                )
     except (fc.NotConverged, TimeoutError, ValueError, MemoryError, PETSc.Error) as error:
         words = " ".join(str(error).split())
         return row | {"failure": f"{type(error).__name__}: {words[:150]}", "steps": len(steps)}

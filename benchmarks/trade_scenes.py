@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks import timing
 from fenics_contact.contact.accuracy import PRESETS
 from scenes.problems import (
-    Body,
+    ContactScene,
     ball_on_half_space,
     greco,
     greco_block,
@@ -93,7 +93,7 @@ class Scene:
     """
 
     name: str
-    make: Callable[[float], Body]
+    make: Callable[[float], ContactScene]
     sizes: tuple[float, ...]
     base: Setting
     reference: Setting | None
@@ -108,7 +108,7 @@ class Scene:
 
 def scene(
     name: str,
-    make: Callable[[float], Body],
+    make: Callable[[float], ContactScene],
     sizes: Sequence[float],
     base: float,
     finest: float | None,
@@ -232,7 +232,11 @@ def sweep(one: Scene, short: bool) -> list[Setting]:
         "increments": (1, 2, 5, 10, 20, 40, 80) if friction else (1, 5),
         "rtol": (1e-2, 1e-3, 1e-4, 1e-6, 1e-12),
         "solver": ("lbfgs", "newton"),
-        "accuracy": (*PRESETS, "0.003", *(() if one.make(one.sizes[0]).history else ("1e-4",))),
+        "accuracy": (
+            *PRESETS,
+            "0.003",
+            *(() if one.make(one.sizes[0]).is_path_dependent else ("1e-4",)),
+        ),
     }
     if friction:
         values["k_t"] = (0.01, 0.1, 10.0, 100.0)

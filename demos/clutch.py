@@ -45,9 +45,9 @@ BOTTOM, TOP = 1, 2
 # Angle of rotation at the ends of increments [°]: small ones at the onset of slip.
 ANGLES = (*np.arange(0.25, 1.6, 0.25), 2.5, *np.arange(5.0, 91.0, 5.0))
 STEADY = 25.0  # angle from which slip is circumferential [°]
-WHOLE, UNTIL = 1.2, 25.0  # rotation of the whole scene [rad], and of the ring meanwhile [°]
+SCENE_ANGLE, UNTIL = 1.2, 25.0  # rotation of the whole scene [rad], and of the ring meanwhile [°]
 SHAFT = np.array([0.0, 0.0, 1.0])
-TURN, TURN_OF_ALL = (fc.Rotation(0.0, (0, 0, 0), axis) for axis in (SHAFT, (1, 2, 2)))
+TURN, SCENE_ROTATION = (fc.Rotation(0.0, (0, 0, 0), axis) for axis in (SHAFT, (1, 2, 2)))
 # Lever arm of friction at full slip with a uniform pressure.
 ARM = 2 / 3 * (RING[1] ** 3 - RING[0] ** 3) / (RING[1] ** 2 - RING[0] ** 2)
 
@@ -131,7 +131,7 @@ def solve(
 
     def with_all(vectors: np.ndarray, t: float) -> np.ndarray:
         """Return the vectors rotated with the whole scene at t."""
-        return TURN_OF_ALL.rotate(vectors, whole * (t + 1) / (until + 1))
+        return SCENE_ROTATION.rotate(vectors, whole * (t + 1) / (until + 1))
 
     def load(t: float) -> None:
         """Press until t = 0, then rotate by t degrees."""
@@ -216,7 +216,7 @@ def main() -> int:
     arguments, _ = parser.parse_known_args()
     start, comm = time.perf_counter(), MPI.COMM_WORLD
     path, problem, rubber = solve(arguments.cells)
-    turned, *_ = solve(arguments.cells, UNTIL, WHOLE)
+    turned, *_ = solve(arguments.cells, UNTIL, SCENE_ANGLE)
     result: dict[str, Any] = {
         "references": compare(path, turned),
         "dofs": problem.u.function_space.dofmap.index_map.size_global * 3,

@@ -59,12 +59,12 @@ def loading(x: np.ndarray, force: float) -> np.ndarray:
     return FRICTION * PEAK * (full - c / A * np.sqrt(np.maximum(0, 1 - (x / c) ** 2)))
 
 
-def unloaded(x: np.ndarray, force: float) -> np.ndarray:
+def residual_shear(x: np.ndarray, force: float) -> np.ndarray:
     """Return the residual shear traction after unloading from ``force`` to zero."""
     return loading(x, force) - 2 * loading(x, force / 2)
 
 
-def bend(force: np.ndarray) -> np.ndarray:
+def nonlinear_displacement(force: np.ndarray) -> np.ndarray:
     """Return the nonlinear part of the displacement in first loading by ``force``."""
     s = force / LIMIT
     return LIMIT / (np.pi * E_STAR) * (1 - s) * np.log(1 - s)
@@ -93,10 +93,12 @@ def solve(arguments: argparse.Namespace) -> tuple[Pressed, dict[str, Any]]:
     for phase, (first, last) in enumerate(itertools.pairwise(turns)):
         for step in fc.increments(scene.problem, scene.shear, first, last, steps=steps):
             points = contact.gather()
-            rubbed = np.linalg.norm(points["tangential_traction"], axis=1) * points["measure"]
+            friction_force = (
+                np.linalg.norm(points["tangential_traction"], axis=1) * points["measure"]
+            )
             moved = comm.allreduce(fem.assemble_scalar(scene.deflection)) - origin
             row = {"force": 2 * R * float(scene.shear.value), "displacement": moved}
-            work = float(rubbed @ (points["slip"] - before))
+            work = float(friction_force @ (points["slip"] - before))
             rows.append(row | {"work": work, "iterations": step.iterations})
             before = points["slip"]
             bar.update()
@@ -118,7 +120,7 @@ def solve(arguments: argparse.Namespace) -> tuple[Pressed, dict[str, Any]]:
             np.interp(0, left["x"][kept, 0], shear[kept])
         ),
     }
-    exact, centre = energy(amplitude), float(unloaded(np.zeros(1), amplitude)[0])
+    exact, centre = energy(amplitude), float(residual_shear(np.zeros(1), amplitude)[0])
     expected = ((exact, ENERGY), (exact, ENERGY), (0.0, CLOSURE), (centre, SHEAR))
     references = dict(zip(values, expected, strict=True))
     result = {
@@ -137,9 +139,9 @@ def draw(path: Path, result: dict[str, Any]) -> None:
     force, moved = (np.array([r[k] for r in result["rows"]]) for k in ("force", "displacement"))
     most, steps = result["amplitude"], (len(force) - 1) // 5
     # The elastic displacement of a fully sticking contact is subtracted to show the loop.
-    stuck = (moved[steps] - bend(np.array(most))) / most - 1 / (np.pi * E_STAR)
+    stuck = (moved[steps] - nonlinear_displacement(np.array(most))) / most - 1 / (np.pi * E_STAR)
     q = np.linspace(0, most, 200)
-    first = bend(q) + q / (np.pi * E_STAR)
+    first = nonlinear_displacement(q) + q / (np.pi * E_STAR)
     swing = 2 * first  # displacement between reversals, at twice the force
     with plotting.figure(path, 2) as (left, right):
         left.plot(1e3 * first, q, "k--", linewidth=1, label="Mindlin, Masing")
@@ -151,7 +153,7 @@ def draw(path: Path, result: dict[str, Any]) -> None:
         left.set(xlabel="displacement by slip [µm]", ylabel="shear force [N/mm]", title=title)
         left.legend(loc="upper left")
         x = np.linspace(-A, A, 801)
-        right.plot(x, unloaded(x, most), "k--", linewidth=1, label="Mindlin")
+        right.plot(x, residual_shear(x, most), "k--", linewidth=1, label="Mindlin")
         right.plot(
             result["left"]["x"],
             result["left"]["shear"],

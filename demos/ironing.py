@@ -41,7 +41,7 @@ from fenics_contact import output, plotting
 from fenics_contact.elasticity import LinearElastic
 
 E, NU, MU, R, P = 1000.0, 0.3, 0.3, 12.0, 4.5
-WAY, SIZE = 4.0, 60.0  # displacement of the cylinder, size of the block
+SLIDE, SIZE = 4.0, 60.0  # displacement of the cylinder, size of the block
 BOTTOM, TOP = 1, 2
 E_STAR = E / (1 - NU**2)
 GAMMA = np.arctan(MU * (1 - 2 * NU) / (2 * (1 - NU))) / np.pi
@@ -64,7 +64,7 @@ def make_mesh(cells: int) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
         gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
         gmsh.model.add("block")
         if MPI.COMM_WORLD.rank == 0:
-            occ, half, reach = gmsh.model.occ, SIZE / 2, WAY / 2 + 3 * HALF_WIDTH
+            occ, half, reach = gmsh.model.occ, SIZE / 2, SLIDE / 2 + 3 * HALF_WIDTH
             corners = [
                 (-half, -half),
                 (half, -half),
@@ -110,7 +110,7 @@ def solve(
     # The displacement of the cylinder is prescribed along x, and follows from the force along y.
     along, press = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
     motion = fc.Motion(displacement=(along, None), force=(None, press))
-    cylinder = fc.Cylinder(point=(-WAY / 2, R), radius=R, displacement=motion)
+    cylinder = fc.Cylinder(point=(-SLIDE / 2, R), radius=R, displacement=motion)
     surface = fc.ContactSurface(mesh, tags, TOP)
     stiffness = fc.RelativeStiffness(arguments.stiffness)
     contact = fc.Contact(u, surface, cylinder, fc.Coulomb(MU, stiffness, stiffness))
@@ -121,7 +121,7 @@ def solve(
     def load(t: float) -> None:
         """Press until t = 1, drag until t = 2."""
         press.value = -P * min(t, 1.0)
-        along.value = WAY * max(t - 1.0, 0.0)
+        along.value = SLIDE * max(t - 1.0, 0.0)
 
     ends = [0.5, 1.0, *(1 + np.arange(1, arguments.increments + 1) / arguments.increments)]
     history: Any = fc.increments(problem, load, 0.0, 2.0, steps=ends, progress="ironing")
@@ -149,7 +149,7 @@ def solve(
         last = float(along.value)
     info: dict[str, Any] = {
         "dofs": V.dofmap.index_map.size_global * 2,
-        "facets_passed": float(WAY / HALF_WIDTH * arguments.cells),
+        "facets_passed": float(SLIDE / HALF_WIDTH * arguments.cells),
         "iterations": iterations,
         "wall_seconds": time.perf_counter() - start,
     }

@@ -36,7 +36,7 @@ from fenics_contact.elasticity import NeoHookean
 
 E, NU, MU, R = 1000.0, 0.3, 0.3, 4.0
 WIDTH, HEIGHT, CELL = 16.0, 10.0, 0.5
-DEPTH, TURN, WAY = 3.0, 0.8, 2.0
+DEPTH, TURN, SLIDE = 3.0, 0.8, 2.0
 K_N, K_T = 1e4, 1e3
 BOTTOM, TOP = 1, 2
 # Pressing until t = 1, rotation until t = 2, dragging until t = 3.
@@ -89,7 +89,7 @@ def solve(moved: str) -> tuple[list[dict[str, float]], fc.ContactProblem, NeoHoo
 
     def load(t: float) -> None:
         """Press until t = 1, rotate until 2, drag until 3."""
-        along = WAY * max(t - 2.0, 0.0)
+        along = SLIDE * max(t - 2.0, 0.0)
         shift.value[:] = along if moved == "disc" else 0.0, -DEPTH * min(t, 1.0)
         angle.value = TURN * float(np.clip(t - 1.0, 0.0, 1.0))
         held.interpolate(

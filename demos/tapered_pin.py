@@ -54,8 +54,8 @@ from fenics_contact.elasticity import LinearElastic
 E, NU, OVERSIZE = 210e3, 0.3, 0.02
 R, OUTER, LENGTH = 10.0, 30.0, 40.0
 BOTTOM, TOP, INSIDE, OUTSIDE = 1, 2, 3, 4
-TURNING = 0.006  # displacement of a friction reversal, relative to the insertion
-BITS = 6
+REVERSAL = 0.006  # displacement of a friction reversal, relative to the insertion
+N_REVERSAL = 6
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Joint:
     free_ends: bool
 
     @property
-    def way(self) -> float:
+    def insertion(self) -> float:
         """The insertion that produces the full interference (length)."""
         return OVERSIZE / self.slope
 
@@ -85,30 +85,33 @@ class Joint:
         pin = (1 - NU) / E if self.free_ends else (1 - nu) / modulus
         return s * self.slope / (r * (hub + pin))
 
-    def pressure(self, s: float, z: np.ndarray, way: int) -> np.ndarray:
-        """Return the pressure on the flank in insertion (``way`` 1) or extraction (-1) (stress)."""
-        return self.lame(s, z) / (1 - way * self.friction * self.slope)
+    def pressure(self, s: float, z: np.ndarray, direction: int) -> np.ndarray:
+        """Return the pressure on the flank (stress).
 
-    def mean_pressure(self, s: float, way: int) -> float:
+        ``direction`` is 1 for insertion and -1 for extraction.
+        """
+        return self.lame(s, z) / (1 - direction * self.friction * self.slope)
+
+    def mean_pressure(self, s: float, direction: int) -> float:
         """Return the mean pressure over the area of the joint (stress)."""
         z = np.linspace(0, LENGTH, 201)
         r = R + self.slope * (z - LENGTH / 2)
-        return float(np.trapezoid(r * self.pressure(s, z, way), z) / np.trapezoid(r, z))
+        return float(np.trapezoid(r * self.pressure(s, z, direction), z) / np.trapezoid(r, z))
 
-    def force(self, s: float, way: int) -> float:
+    def force(self, s: float, direction: int) -> float:
         """Return the force on the pin at the insertion ``s``; a push is positive (force).
 
-        ``way`` is 1 for insertion and -1 for extraction.
+        ``direction`` is 1 for insertion and -1 for extraction.
         """
         z = np.linspace(0, LENGTH, 201)
         r = R + self.slope * (z - LENGTH / 2)
-        covered = 1 - (self.way - s) / LENGTH
+        covered = 1 - (self.insertion - s) / LENGTH
         radial = covered * float(np.trapezoid(2 * np.pi * r * self.lame(s, z), z))
-        return radial * self.tangent(way)
+        return radial * self.tangent(direction)
 
-    def tangent(self, way: int) -> float:
+    def tangent(self, direction: int) -> float:
         """Return the ratio tan(α ± φ) of axial to radial force."""
-        t, m = self.slope, way * self.friction
+        t, m = self.slope, direction * self.friction
         return (t + m) / (1 - t * m)
 
 
@@ -118,7 +121,7 @@ class Scene:
 
     Attributes:
         joint: The reference solution.
-        way: Prescribed axial displacement of the ends of the pin (length).
+        displacement: Prescribed axial displacement of the ends of the pin (length).
         traction: Traction on both ends of the pin, downwards (stress).
         path: Load parameter, insertion and push after every increment; a pull is negative.
         pressures: By name, heights of the points of the joint, and their pressure.
@@ -127,7 +130,7 @@ class Scene:
     joint: Joint
     steel: LinearElastic
     problem: fc.ContactProblem
-    way: fem.Constant
+    displacement: fem.Constant
     traction: fem.Constant
     path: list[tuple[float, float, float]] = field(default_factory=list)
     iterations: list[int] = field(default_factory=list)
@@ -135,22 +138,23 @@ class Scene:
     mean_pressure: dict[str, float] = field(default_factory=dict)
     dissipation: float = 0.0
 
-    def lead(self, steps: list[float]) -> None:
+    def solve_increments(self, steps: list[float]) -> None:
         """Solve increments that end at ``steps``. Collective.
 
         These are insertions, or, with free ends, fractions of the full insertion force.
         """
         joint, contact = self.joint, self.problem.contacts[0]
         area = np.pi * sum(
-            (R + joint.slope * (z - LENGTH / 2)) ** 2 for z in (joint.way, joint.way + LENGTH)
+            (R + joint.slope * (z - LENGTH / 2)) ** 2
+            for z in (joint.insertion, joint.insertion + LENGTH)
         )
-        most = joint.force(joint.way, 1)
+        most = joint.force(joint.insertion, 1)
 
         def load(value: float) -> None:
             if joint.free_ends:
                 self.traction.value = value * most / area
             else:
-                self.way.value = -value
+                self.displacement.value = -value
 
         start = self.path[-1][0] if self.path else 0.0
         words = f"μ = {joint.friction:g}, {'force' if joint.free_ends else 'way'}"
@@ -158,14 +162,15 @@ class Scene:
         for step in history:
             # Friction strains the pin antisymmetrically: the mean does not change.
             ends = [
-                output.at_node(self.problem.u, (0.0, z))[1] for z in (joint.way, joint.way + LENGTH)
+                output.at_node(self.problem.u, (0.0, z))[1]
+                for z in (joint.insertion, joint.insertion + LENGTH)
             ]
             push = float(contact.resultants().force[1])
             self.path.append((step.load, -float(np.mean(ends)), push))
             self.iterations.append(step.iterations)
             self.dissipation += step.energy.dissipation
 
-    def keep(self, name: str) -> None:
+    def store_pressure(self, name: str) -> None:
         """Store the present pressure along the joint. Collective."""
         points = self.problem.contacts[0].gather()
         order = np.argsort(points["x"][:, 1])
@@ -206,7 +211,7 @@ def make(joint: Joint, cells: int) -> Scene:
     flank, finer = (R, joint.slope), round(2.1 * cells)
     parts = {
         "hub": block((flank, (OUTER, 0.0)), (0.0, LENGTH), (6, cells)),
-        "pin": block(((0.0, 0.0), flank), (joint.way, joint.way + LENGTH), (3, finer)),
+        "pin": block(((0.0, 0.0), flank), (joint.insertion, joint.insertion + LENGTH), (3, finer)),
     }
     joined = fc.join_meshes(parts)
     mesh = joined.mesh
@@ -214,7 +219,7 @@ def make(joint: Joint, cells: int) -> Scene:
     u, v = fem.Function(V, name="displacement"), ufl.TestFunction(V)
     # Small strains, as in Lamé's solution: the axial rigid-body motion of the pin does not matter.
     steel = LinearElastic(u, E, NU, "axisymmetric")
-    way, traction = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
+    displacement, traction = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
     ends = tuple(joined.facet("pin", tag) for tag in (BOTTOM, TOP))
     rollers = tuple(joined.facet("hub", tag) for tag in (BOTTOM, TOP))
 
@@ -228,7 +233,7 @@ def make(joint: Joint, cells: int) -> Scene:
         ds = ufl.Measure("ds", domain=mesh, subdomain_data=joined.facets)
         F += steel.weight * traction * v[1] * ds(ends)
     else:
-        bcs.append(hold(1, ends, way))
+        bcs.append(hold(1, ends, displacement))
     contact = fc.Contact(
         u,
         fc.ContactSurface(mesh, joined.facets, joined.facet("pin", OUTSIDE)),
@@ -240,48 +245,50 @@ def make(joint: Joint, cells: int) -> Scene:
         weight=steel.weight,
     )
     problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method="newton")
-    return Scene(joint, steel, problem, way, traction)
+    return Scene(joint, steel, problem, displacement, traction)
 
 
-def led(joint: Joint, cells: int) -> Scene:
+def press_by_displacement(joint: Joint, cells: int) -> Scene:
     """Press the pin in and pull it out by prescribed displacements. Collective."""
-    scene, s = make(joint, cells), joint.way
+    scene, s = make(joint, cells), joint.insertion
     # Increments of a fifth of a facet; during the friction reversal, of 0.001 of the insertion.
     number = 2 * int(np.ceil(s / (0.4 * LENGTH / cells)))
-    way_in = [s * i / number for i in range(1, number + 1)]
-    scene.lead(way_in)
-    scene.keep("pushed")
-    scene.lead([s * (1 - TURNING * i / BITS) for i in range(1, 2 * BITS + 1)])
-    scene.keep("pulled")
-    scene.lead([*(x for x in reversed(way_in) if x < 0.98 * s), 0.0, -0.02 * s])
+    insertions = [s * i / number for i in range(1, number + 1)]
+    scene.solve_increments(insertions)
+    scene.store_pressure("pushed")
+    scene.solve_increments(
+        [s * (1 - REVERSAL * i / N_REVERSAL) for i in range(1, 2 * N_REVERSAL + 1)]
+    )
+    scene.store_pressure("pulled")
+    scene.solve_increments([*(x for x in reversed(insertions) if x < 0.98 * s), 0.0, -0.02 * s])
     return scene
 
 
-def forced(joint: Joint, cells: int) -> Scene:
+def press_by_force(joint: Joint, cells: int) -> Scene:
     """Press the pin in by a force and remove the force. Collective.
 
     Load parameters are fractions of the full insertion force.
     """
     scene = make(joint, cells)
-    scene.lead([0.1 * i for i in range(1, 11)])
-    scene.keep("pushed")
+    scene.solve_increments([0.1 * i for i in range(1, 11)])
+    scene.store_pressure("pushed")
     if joint.friction > joint.slope:
-        scene.lead([0.75, 0.5, 0.25, 0.0])
+        scene.solve_increments([0.75, 0.5, 0.25, 0.0])
     else:
         hold = joint.tangent(-1) / joint.tangent(1)
         # From a tenth above the holding force to zero in equal steps.
-        scene.lead([1.1 * hold, *(hold * i / 10 for i in range(9, -1, -1))])
+        scene.solve_increments([1.1 * hold, *(hold * i / 10 for i in range(9, -1, -1))])
     return scene
 
 
 def compare(dry: Scene, pushed: Scene, oiled: Scene) -> dict[str, Any]:
     """Compare the results with Lamé's and Coulomb's."""
     entries: dict[str, tuple[float, float, float]] = {}  # value, reference, tolerance
-    joint, s = dry.joint, dry.joint.way
+    joint, s = dry.joint, dry.joint.insertion
     # Length of each uncovered end at half depth, relative to the length of the joint.
     bare = s / 2 / LENGTH
     for name, way in (("pushed", 1), ("pulled", -1)):
-        at = s if way == 1 else s * (1 - 2 * TURNING)
+        at = s if way == 1 else s * (1 - 2 * REVERSAL)
         value = dry.mean_pressure[name]
         motion = "insertion" if way == 1 else "extraction"
         entries[f"mean pressure, {motion} [MPa]"] = (value, joint.mean_pressure(at, way), 0.005)
@@ -335,7 +342,7 @@ def compare(dry: Scene, pushed: Scene, oiled: Scene) -> dict[str, Any]:
 
 def draw(path: Path, dry: Scene, pushed: Scene, oiled: Scene) -> None:
     """Plot pressure along the joint, and forces over insertion. On this rank."""
-    joint, s = dry.joint, dry.joint.way
+    joint, s = dry.joint, dry.joint.insertion
     z = np.linspace(0, LENGTH, 200)
     x = np.linspace(0, s, 100)
     with plotting.figure(path, 3, (5.2, 4.6)) as (left, middle, right):
@@ -355,9 +362,9 @@ def draw(path: Path, dry: Scene, pushed: Scene, oiled: Scene) -> None:
         _, places, forces = np.array([(0.0, 0.0, 0.0), *oiled.path]).T
         right.plot(places, forces / 1e3, ".-", color="#4a9a4a", label="pushed, released")
         for ax, one in ((middle, joint), (right, oiled.joint)):
-            for way in (1, -1):
-                known = [one.force(at, way) / 1e3 for at in x]
-                label = "Q tan(φ ± α)" if way == 1 else None
+            for direction in (1, -1):
+                known = [one.force(at, direction) / 1e3 for at in x]
+                label = "Q tan(φ ± α)" if direction == 1 else None
                 ax.plot(x, known, "k--", lw=1, label=label)
             ax.axhline(0, color="k", lw=0.5)
             ax.set(xlabel="way of the pin s [mm]", ylabel="push (pull below zero) [kN]")
@@ -383,9 +390,9 @@ def main() -> int:
     if not 0 < oil < slope < friction:
         parser.error("the pin needs 0 < oil < slope < friction")
     start, comm = time.perf_counter(), MPI.COMM_WORLD
-    dry = led(Joint(slope, friction, free_ends=False), arguments.cells)
-    pushed = forced(Joint(slope, friction, free_ends=True), arguments.cells)
-    oiled = forced(Joint(slope, oil, free_ends=True), arguments.cells)
+    dry = press_by_displacement(Joint(slope, friction, free_ends=False), arguments.cells)
+    pushed = press_by_force(Joint(slope, friction, free_ends=True), arguments.cells)
+    oiled = press_by_force(Joint(slope, oil, free_ends=True), arguments.cells)
     result: dict[str, Any] = {
         "references": compare(dry, pushed, oiled),
         "dofs": dry.problem.u.function_space.dofmap.index_map.size_global * 2,

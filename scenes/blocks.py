@@ -17,9 +17,9 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact import compat
 from fenics_contact.types import Array
-from scenes.elasticity import displacement_space, hold, strain, stress
-from scenes.meshes import mesh_of, one_rank_each
-from scenes.tags import sides
+from scenes.elasticity import dirichlet_bc, displacement_space, strain, stress
+from scenes.meshes import create_mesh, partition_from_owners
+from scenes.tags import tag_by_nodes
 
 CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 GRID = [(cell, degree) for cell in CELLS for degree in (1, 2)]
@@ -69,14 +69,14 @@ def block_mesh(
     if partitioner is None:
         partitioner = compat.cell_partitioner(ghost_mode)
     degree = 1 if bend is None else 2
-    mesh = mesh_of(cell, x * size, cells, degree=degree, comm=comm, partitioner=partitioner)
+    mesh = create_mesh(cell, x * size, cells, degree=degree, comm=comm, partitioner=partitioner)
     tags = side_tags(mesh, size)
     if bend is not None:  # after the sides have been located
         mesh.geometry.x[:, :d] = bend(mesh.geometry.x[:, :d])
     return mesh, tags
 
 
-def layers(cell: str) -> Callable:
+def layer_partitioner(cell: str) -> Callable:
     """Return a partitioner that gives every rank a contiguous range of the cells.
 
     In boxes one cell wide these ranges are layers, numbered from the bottom.
@@ -85,7 +85,7 @@ def layers(cell: str) -> Callable:
 
     def partition(comm: MPI.Comm, n_parts: int, cell_types: Any, cells: Any) -> Any:
         n_cells = cells[0].size // n_vertices
-        return one_rank_each(np.arange(n_cells) * n_parts // max(n_cells, 1))
+        return partition_from_owners(np.arange(n_cells) * n_parts // max(n_cells, 1))
 
     return partition
 
@@ -118,7 +118,7 @@ def side_tags(mesh: dolfinx.mesh.Mesh, size: Sequence[float]) -> dolfinx.mesh.Me
     if d == 3:
         ends |= {FRONT: (1, 0.0), BACK: (1, size[1])}
     off = 1e-8 * max(size)
-    return sides(
+    return tag_by_nodes(
         mesh, {t: lambda x, i=i, at=at: np.abs(x[i] - at) < off for t, (i, at) in ends.items()}
     )
 
@@ -139,7 +139,7 @@ def polynomial(d: int, degree: int, seed: int, size: float) -> Callable[[Array],
     return value
 
 
-def wave(d: int, seed: int) -> Callable[[Array], Array]:
+def rough_field(d: int, seed: int) -> Callable[[Array], Array]:
     """Return a rough field, a direction for derivatives, the same on any number of ranks."""
     rng = np.random.default_rng(seed)
     phases, waves = rng.uniform(0, 6, (d, 1)), rng.uniform(3, 9, (d, d))
@@ -192,7 +192,7 @@ class Block:
         """Set the traction on the top."""
         self.traction.value[:] = self.vector(side=side, up=up)
 
-    def pull(self, tag: int, traction: Array) -> fem.Constant:
+    def add_traction(self, tag: int, traction: Array) -> fem.Constant:
         """Add a traction on the side ``tag`` to the residual, and return its constant."""
         given = fem.Constant(self.mesh, traction)
         v = ufl.TestFunction(self.u.function_space)
@@ -207,14 +207,14 @@ class Block:
         fdim = self.dim - 1
         return fem.locate_dofs_topological(space, fdim, self.tags.find(tag))
 
-    def hold(self, tag: int, component: int, value: Any = 0.0) -> fem.DirichletBC:
+    def dirichlet_bc(self, tag: int, component: int, value: Any = 0.0) -> fem.DirichletBC:
         """Return the Dirichlet condition for one component of u on a side."""
-        return hold(self.u, self.tags, tag, component, value)
+        return dirichlet_bc(self.u, self.tags, tag, component, value)
 
     def rollers(self) -> list[fem.DirichletBC]:
         """Return zero normal displacement on the planes x = 0 and, in 3D, y = 0."""
-        bcs = [self.hold(LEFT, 0)]
-        return bcs + ([self.hold(FRONT, 1)] if self.dim == 3 else [])
+        bcs = [self.dirichlet_bc(LEFT, 0)]
+        return bcs + ([self.dirichlet_bc(FRONT, 1)] if self.dim == 3 else [])
 
     def floor(self, *, displacement: Any = None) -> fc.HalfSpace:
         """Return a half-space whose plane touches the bottom."""
@@ -272,7 +272,7 @@ def block(
     return made
 
 
-def bulge(scene: Block, depth: float = 0.01) -> fc.Obstacle:
+def parabolic_floor(scene: Block, depth: float = 0.01) -> fc.Obstacle:
     """Return a parabolic floor with the gap ``depth`` (x - 0.4)² below the bottom."""
     x = ufl.SpatialCoordinate(scene.mesh)
     return fc.PrescribedGap(depth * (x[0] - 0.4) ** 2, scene.vector(up=-1.0))

@@ -13,9 +13,9 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.types import Array
-from scenes.elasticity import displacement_space, hold, strain, stress
-from scenes.meshes import mesh_of
-from scenes.tags import Where, tagged
+from scenes.elasticity import dirichlet_bc, displacement_space, strain, stress
+from scenes.meshes import create_mesh
+from scenes.tags import FacetSelector, tag_by_midpoints
 
 COMM = MPI.COMM_WORLD
 
@@ -32,7 +32,7 @@ def graded(fine: float, cells: int, end: float, growth: float = 1.25) -> Array:
 
 def boxes(
     axes: Sequence[Sequence[Array]],
-    sides: Mapping[int, Where],
+    sides: Mapping[int, FacetSelector],
     *,
     simplex: bool = False,
     bend: Callable[[Array], Array] | None = None,
@@ -69,12 +69,12 @@ def boxes(
     if simplex:
         kind, quads = "triangle", np.concatenate([quads[:, [0, 1, 3]], quads[:, [0, 3, 2]]])
     if degree > 1:
-        serial = mesh_of(kind, x, quads, comm=MPI.COMM_SELF)
+        serial = create_mesh(kind, x, quads, comm=MPI.COMM_SELF)
         nodes = fem.functionspace(serial, ("Lagrange", degree))
         x = nodes.tabulate_dof_coordinates()[:, :d]
         quads = nodes.dofmap.list
-    mesh = mesh_of(kind, x, quads, degree=degree, partitioner=partitioner)
-    tags = tagged(mesh, sides)
+    mesh = create_mesh(kind, x, quads, degree=degree, partitioner=partitioner)
+    tags = tag_by_midpoints(mesh, sides)
     if bend is not None:
         mesh.geometry.x[:, :d] = bend(mesh.geometry.x[:, :d])
     return mesh, tags
@@ -89,19 +89,19 @@ class Bodies:
         v: Test function.
         stress: σ(u) (UFL).
         F: Residual; loads are subtracted from it by the caller.
-        bcs: Dirichlet conditions added by `hold`.
+        bcs: Dirichlet conditions added by `prescribe`.
     """
 
     def __init__(
         self,
-        made: tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags],
+        mesh_and_tags: tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags],
         E: Any,
         nu: float,
         *,
         degree: int = 1,
     ) -> None:
         """Create displacement and residual. Collective."""
-        self.mesh, self.tags = made
+        self.mesh, self.tags = mesh_and_tags
         self.d = self.mesh.geometry.dim
         space = displacement_space(self.mesh, degree)
         self.u, self.v = fem.Function(space, name="displacement"), ufl.TestFunction(space)
@@ -130,11 +130,11 @@ class Bodies:
         """Return the measure of a side."""
         return ufl.ds(self.mesh, subdomain_data=self.tags)(tag)
 
-    def hold(self, tag: int, *components: int, value: Any = 0.0) -> None:
+    def prescribe(self, tag: int, *components: int, value: Any = 0.0) -> None:
         """Prescribe components of the displacement on a side. Collective."""
         if not isinstance(value, fem.Constant):  # one for all components
             value = self.constant(value)
-        self.bcs += [hold(self.u, self.tags, tag, i, value) for i in components]
+        self.bcs += [dirichlet_bc(self.u, self.tags, tag, i, value) for i in components]
 
     def contact(
         self, tag: Any, obstacle: Any, law: Any, *, quadrature: int | None = None, **options: Any
@@ -156,7 +156,9 @@ class Bodies:
         middle = dolfinx.mesh.compute_midpoints(self.mesh, self.d, cells).reshape(-1, 3)
         return cells[where(middle[:, : self.d])]
 
-    def displace(self, field: Callable[[Array], Array], where: Callable[[Array], Array]) -> None:
+    def set_displacement(
+        self, field: Callable[[Array], Array], where: Callable[[Array], Array]
+    ) -> None:
         """Set the displacement of the selected cells and update ghosts. Collective.
 
         The selected cells must have no node in common with the others.

@@ -19,16 +19,22 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from scenes.elasticity import displacement_space, hold, residual
+from scenes.elasticity import dirichlet_bc, displacement_space, residual
 from scenes.histories import History
 
 LENGTH, WIDTH, THICKNESS, OVERLAP = 40.0, 20.0, 4.0, 30.0  # mm
 BORE, SHANK, HEAD, HEIGHT = 3.3, 3.0, 5.5, 3.0  # radii, and the height of head and nut
 E, NU, FRICTION, INTERFERENCE = 210e3, 0.3, 0.2, 0.02  # MPa, mm
 # Tags: fixed and pulled end of the plates, both sides of the three contacts.
-HELD, PULLED, UNDER, OVER, SEAT, RING, NUT_SEAT, NUT_RING = range(1, 9)
+FIXED, PULLED, LOWER_PLATE, UPPER_PLATE, PLATE_UNDER_HEAD, HEAD_FACE, PLATE_ON_NUT, NUT_FACE = (
+    range(1, 9)
+)
 _LOWER, _UPPER, _BOLT = 1, 2, 3
-_JOINTS = {"plates": (UNDER, OVER), "head": (RING, SEAT), "nut": (NUT_RING, NUT_SEAT)}
+_JOINTS = {
+    "plates": (LOWER_PLATE, UPPER_PLATE),
+    "head": (HEAD_FACE, PLATE_UNDER_HEAD),
+    "nut": (NUT_FACE, PLATE_ON_NUT),
+}
 
 
 def joint_mesh(size: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
@@ -52,9 +58,13 @@ def joint_mesh(size: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
             occ.synchronize()
             groups: dict[int, list[int]] = {tag: [] for tag in range(1, 9)}
             places = {
-                _LOWER: {UNDER: (2, THICKNESS), NUT_SEAT: (2, 0.0), HELD: (0, 0.0)},
-                _UPPER: {OVER: (2, THICKNESS), SEAT: (2, top), PULLED: (0, shift + LENGTH)},
-                _BOLT: {RING: (2, top), NUT_RING: (2, 0.0)},
+                _LOWER: {LOWER_PLATE: (2, THICKNESS), PLATE_ON_NUT: (2, 0.0), FIXED: (0, 0.0)},
+                _UPPER: {
+                    UPPER_PLATE: (2, THICKNESS),
+                    PLATE_UNDER_HEAD: (2, top),
+                    PULLED: (0, shift + LENGTH),
+                },
+                _BOLT: {HEAD_FACE: (2, top), NUT_FACE: (2, 0.0)},
             }
             for body, sides in places.items():
                 gmsh.model.addPhysicalGroup(3, [volumes[body][1]], body)
@@ -85,7 +95,7 @@ class BoltedJoint(History):
         u: Displacement.
         tags: Facet tags.
         contacts: Contacts of plates, head and nut.
-        tight: Interference under the head (length).
+        interference: Interference under the head (length).
         pull: Load on the end of the upper plate (force).
         problem: Problem with the three contacts.
     """
@@ -110,11 +120,11 @@ class BoltedJoint(History):
         self.tags = tags
         space = displacement_space(mesh, degree)
         self.u, v = fem.Function(space, name="displacement"), ufl.TestFunction(space)
-        self.tight, self.pull = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
+        self.interference, self.pull = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
         contact = {"accuracy": "standard"} | (contact or {})
         self.contacts = []
         for name, (mine, other) in _JOINTS.items():
-            gap = {"gap": -self.tight} if name == "head" else {}
+            gap = {"gap": -self.interference} if name == "head" else {}
             surface = fc.ContactSurface(mesh, tags, mine)
             obstacle = fc.DeformableBody(tags, other)
             law = fc.Coulomb(FRICTION)
@@ -122,11 +132,11 @@ class BoltedJoint(History):
             self.contacts.append(made)
         ds = ufl.Measure("ds", mesh, subdomain_data=tags)(PULLED)
         F = residual(self.u, v, E, NU) - self.pull / (WIDTH * THICKNESS) * v[0] * ds
-        bcs = [hold(self.u, tags, HELD, i) for i in range(3)]
-        bcs += [hold(self.u, tags, PULLED, i) for i in (1, 2)]
+        bcs = [dirichlet_bc(self.u, tags, FIXED, i) for i in range(3)]
+        bcs += [dirichlet_bc(self.u, tags, PULLED, i) for i in (1, 2)]
         self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=self.contacts, **options)
 
     def load(self, t: float) -> None:
         """Set the interference and the load at t."""
-        self.tight.value = INTERFERENCE * min(t, 1.0)
+        self.interference.value = INTERFERENCE * min(t, 1.0)
         self.pull.value = 1000.0 * max(t - 1.0, 0.0)

@@ -30,7 +30,7 @@ def residual(u: fem.Function, v: Any, E: Any, nu: Any) -> ufl.Form:
     return ufl.inner(stress(u, E, nu), strain(v)) * ufl.dx(u.function_space.mesh)
 
 
-def hold(
+def dirichlet_bc(
     u: fem.Function, tags: dolfinx.mesh.MeshTags, tag: int, component: int, value: Any = 0.0
 ) -> fem.DirichletBC:
     """Return the Dirichlet condition for one component on a side, by a number or a constant."""

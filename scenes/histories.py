@@ -14,9 +14,9 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.types import Array
 from scenes.blocks import RIGHT, TOP, block
-from scenes.comparing import at_points, close, nodal, owned
+from scenes.comparison import is_close, nodal_values, owned_values, point_values
 from scenes.elasticity import strain
-from scenes.two_blocks import Slider
+from scenes.two_blocks import SlidingBlock
 
 COMM = MPI.COMM_WORLD
 
@@ -39,7 +39,7 @@ class History:
         return fc.increments(self.problem, self.load, start, end, **options)
 
 
-class Press(History):
+class BlockOnBallHistory(History):
     """A block on a ball, by default with friction; its top or the ball has a prescribed motion."""
 
     def __init__(
@@ -58,10 +58,14 @@ class Press(History):
         tilt: float = 0.0,
         degree: int = 1,
         names: tuple[str, str] = ("floor", "wall"),
-        held: Sequence[int] | None = None,
+        prescribed_components: Sequence[int] | None = None,
         **options: Any,
     ) -> None:
-        """Create the unloaded problem; ``held``: prescribed components of the top (default all)."""
+        """Create the unloaded problem.
+
+        ``prescribed_components`` are the components of the displacement that are prescribed on the
+        top, by default all.
+        """
         scene = self.scene = block(cell, degree, n=n, E=E, surface=surface)
         mesh, d = scene.mesh, scene.dim
         law = law or fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
@@ -69,7 +73,7 @@ class Press(History):
         self.shift = fem.Constant(mesh, np.zeros(d))
         self.force = fem.Constant(mesh, 0.0)
         self.plastic = fem.Function(fem.functionspace(mesh, ("DG", 0)), name="plastic")
-        self.moves = obstacle
+        self.loading = obstacle
         displacement: Any = None
         if obstacle == "moving":
             displacement = self.shift
@@ -83,7 +87,10 @@ class Press(History):
         center[-1] = -radius
         center[0] += tilt
         ball = fc.Ball(center, radius, displacement=displacement)
-        bcs = [scene.hold(TOP, i, self.push[i]) for i in (range(d) if held is None else held)]
+        bcs = [
+            scene.dirichlet_bc(TOP, i, self.push[i])
+            for i in (range(d) if prescribed_components is None else prescribed_components)
+        ]
         F = scene.F
         if bulk != "linear":
             eps = strain(scene.u) - self.plastic * ufl.Identity(d)
@@ -104,15 +111,15 @@ class Press(History):
     def load(self, t: float) -> None:
         """Set the displacement of the top or of the ball, or the force on the ball."""
         down, along = 0.03 * min(t, 1.0), np.interp(t, [1, 2, 4], [0, 0.1, -0.1])
-        if self.moves == "fixed":
+        if self.loading == "fixed":
             self.push[-1].value, self.push[0].value = -down, along
-        elif self.moves == "moving":
+        elif self.loading == "moving":
             self.shift.value[-1], self.shift.value[0] = down, -along
         else:
             self.force.value, self.along.value = 20 * min(t, 1.0), -along
 
 
-class Ramp(Slider, History):
+class BlockOnRamp(SlidingBlock, History):
     """A block dragged up the ramp of another body, with updated pairs and a prescribed top."""
 
     def __init__(
@@ -130,36 +137,36 @@ class Ramp(Slider, History):
 
     def load(self, t: float) -> None:
         """Press, drag over one and a half facets of the base, and drag back by half a facet."""
-        self.move[-1].value = -0.004 * min(t, 1.0)
-        self.move[0].value = np.interp(t, [1, 3, 4], [0, 0.6, 0.4])
+        self.top_displacement[-1].value = -0.004 * min(t, 1.0)
+        self.top_displacement[0].value = np.interp(t, [1, 3, 4], [0, 0.6, 0.4])
 
 
 # ---- states --------------------------------------------------------------------------------------
 
 
-def picture(made: History) -> dict[str, Array]:
+def collect_state(history: History) -> dict[str, Array]:
     """Return all data of a state, in an order independent of the distribution to ranks."""
-    problem = made.problem
+    problem = history.problem
     found = {"u": _nodal(problem, problem.u), "increment": np.array([problem.increment])}
     field = fem.Function(problem.u.function_space)
     state, _, internal, external, *_ = problem.committed_rows()
     for name, row in (("state", state), ("internal", internal), ("external", external)):
-        owned(field)[:] = row[: problem.full.unknowns.n_dofs]
+        owned_values(field)[:] = row[: problem.full.unknowns.n_dofs]
         found[f"committed {name}"] = _nodal(problem, field)
     found["state of obstacles"] = problem.full.unknowns.motions(state)
     energy = problem.state.energy
     found["springs"] = np.array([COMM.allreduce(sum(map(np.sum, energy.springs)))])
     if problem.solver.condensed:
-        found["kept"] = problem.solver.system.unknowns.retained
-    for c, ways in zip(problem.contacts, energy.contacts, strict=True):
-        found[f"{c.name} history"] = at_points(c, c.history.rows())
-        found[f"{c.name} jump"] = at_points(c, c.contact_kinematics.committed_jump)
-        found[f"{c.name} ways"] = at_points(c, np.hstack(ways))
+        found["retained dofs"] = problem.solver.system.unknowns.retained
+    for c, slip_distances in zip(problem.contacts, energy.contacts, strict=True):
+        found[f"{c.name} history"] = point_values(c, c.history.rows())
+        found[f"{c.name} jump"] = point_values(c, c.contact_kinematics.committed_jump)
+        found[f"{c.name} slip distances"] = point_values(c, np.hstack(slip_distances))
         if c.multipliers is not None:
-            found[f"{c.name} multipliers"] = at_points(c, c.multipliers.fields.rows())
+            found[f"{c.name} multipliers"] = point_values(c, c.multipliers.fields.rows())
         for name, values in c.values.arrays.items():
-            found[f"{c.name} {name}"] = at_points(c, np.column_stack([values]))
-        found[f"{c.name} status"] = at_points(c, c.status)
+            found[f"{c.name} {name}"] = point_values(c, np.column_stack([values]))
+        found[f"{c.name} status"] = point_values(c, c.status)
         r = c.resultants()
         found[f"{c.name} counts"] = np.array([r.open, r.stick, r.slip, c.n_unpaired])
         found[f"{c.name} forces"] = np.r_[r.force, r.normal_force, r.tangential_force]
@@ -169,73 +176,73 @@ def picture(made: History) -> dict[str, Array]:
 def _nodal(problem: fc.ContactProblem, field: fem.Function) -> Array:
     """Return nodal values of a field in the space of u, ordered by position."""
     if not problem.displacement.is_mixed:
-        return nodal(field)
+        return nodal_values(field)
     parts = range(field.function_space.num_sub_spaces)
-    return np.concatenate([nodal(field.sub(i).collapse()).ravel() for i in parts])
+    return np.concatenate([nodal_values(field.sub(i).collapse()).ravel() for i in parts])
 
 
-def differences(a: History, b: History, tolerance: float) -> list[str]:
+def find_differences(a: History, b: History, tolerance: float) -> list[str]:
     """Return the names of the data that differ between two states.
 
     With tolerance 0 all data are compared bit for bit, otherwise displacements, contact histories,
     jumps and resultant forces.
     """
-    one, other = picture(a), picture(b)
+    one, other = collect_state(a), collect_state(b)
     assert one.keys() == other.keys()
     if tolerance == 0.0:
         return [n for n in one if not np.array_equal(one[n], other[n], equal_nan=True)]
     # Differences are relative to the largest value; round-off may change the status of a point.
     compared = [n for n in one if n.split()[-1] in ("u", "state", "history", "jump", "forces")]
-    return [n for n in compared if not close(one[n], other[n], tolerance)]
+    return [n for n in compared if not is_close(one[n], other[n], tolerance)]
 
 
-def same_energies(a: fc.Step, b: fc.Step, tolerance: float) -> bool:
+def have_equal_energies(a: fc.Step, b: fc.Step, tolerance: float) -> bool:
     """Return whether the energies of two steps agree, at best to a round-off of 1e-12."""
     size = abs(b.energy.work) + abs(b.energy.elastic)
     names = ("work", "elastic", "springs", "dissipation", "remainder")
     pairs = [(getattr(a.energy, n), getattr(b.energy, n)) for n in names]
-    return all(close(x, y, max(tolerance, 1e-12), scale=size) for x, y in pairs)
+    return all(is_close(x, y, max(tolerance, 1e-12), scale=size) for x, y in pairs)
 
 
-def goes_on(
+def assert_restart_equals_uninterrupted(
     make: Callable[[], History],
     folder: Path,
     *,
     stop: int,
     tolerance: float | None = None,
-    tamper: Callable[[History], None] | None = None,
+    modify: Callable[[History], None] | None = None,
     **options: Any,
 ) -> None:
     """Assert that a history restarted after ``stop`` increments equals an uninterrupted one."""
-    whole, broken, after, again = (make() for _ in range(4))
-    tolerance = whole.tolerance if tolerance is None else tolerance
+    uninterrupted, interrupted, restarted, finished = (make() for _ in range(4))
+    tolerance = uninterrupted.tolerance if tolerance is None else tolerance
     tolerance = 0.0 if COMM.size == 1 else tolerance
-    for made in (whole, broken, after, again) if tamper else ():
-        tamper(made)
-    expected = list(whole.increments(checkpoint=folder / "whole.npz", **options))
+    for history in (uninterrupted, interrupted, restarted, finished) if modify else ():
+        modify(history)
+    expected = list(uninterrupted.increments(checkpoint=folder / "whole.npz", **options))
     path = folder / "broken.npz"
     n = 0
-    for _ in broken.increments(checkpoint=path, **options):
+    for _ in interrupted.increments(checkpoint=path, **options):
         n += 1
         if n == stop:
             break
-    rest = list(after.increments(checkpoint=path, **options))
+    rest = list(restarted.increments(checkpoint=path, **options))
     assert 0 < len(rest) < len(expected)
     for step, reference in zip(rest, expected[-len(rest) :], strict=True):
         assert step.increment == reference.increment
         assert step.load == reference.load
         assert step.complete == reference.complete
-        assert same_energies(step, reference, tolerance)
+        assert have_equal_energies(step, reference, tolerance)
         if reference.increment_error:
             for name, error in reference.increment_error.items():
-                assert close(step.increment_error[name], error, max(tolerance, 1e-9))
+                assert is_close(step.increment_error[name], error, max(tolerance, 1e-9))
         for name, r in reference.contacts.items():
             scale = np.abs(r.force).max()
             found = step.contacts[name].force
-            assert close(found, r.force, tolerance, scale=scale), step.increment
-    assert differences(after, whole, tolerance) == []
+            assert is_close(found, r.force, tolerance, scale=scale), step.increment
+    assert find_differences(restarted, uninterrupted, tolerance) == []
     # A finished history is restored at its end, including results and status.
-    assert not list(again.increments(checkpoint=path, **options))
-    assert differences(again, after, 0.0 if COMM.size == 1 else 1e-12) == []
-    slips = ([c.resultants().slip for c in m.problem.contacts] for m in (again, after))
+    assert not list(finished.increments(checkpoint=path, **options))
+    assert find_differences(finished, restarted, 0.0 if COMM.size == 1 else 1e-12) == []
+    slips = ([c.resultants().slip for c in m.problem.contacts] for m in (finished, restarted))
     assert len({tuple(found) for found in slips}) == 1

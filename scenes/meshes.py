@@ -13,7 +13,7 @@ from mpi4py import MPI
 from fenics_contact.types import Array, Index
 
 
-def mesh_of(
+def create_mesh(
     cell: str,
     x: Array,
     cells: Array,
@@ -40,7 +40,7 @@ def mesh_of(
     )
 
 
-def one_rank_each(owner: Index) -> Any:
+def partition_from_owners(owner: Index) -> Any:
     """Return a partitioner's result that assigns every cell to its rank ``owner``, (n_cells,)."""
     owner = owner.astype(np.int32)
     lists = dolfinx.graph.adjacencylist(owner, np.arange(len(owner) + 1, dtype=np.int32))

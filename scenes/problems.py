@@ -1,8 +1,8 @@
 """Contact problems of the demos and of the benchmarks, described apart from their solution.
 
-A `Body` has mesh, obstacle and loads. `parts` makes its displacement, residual and conditions,
-`problem` the contact problem of this package, and `penalty` the boundary form of a reference
-solution with DOLFINx alone.
+A `ContactScene` has mesh, obstacle and loads. `elasticity_problem` makes its displacement, residual
+and Dirichlet conditions, `problem` the contact problem of this package, and
+`reference_penalty_traction` the boundary form of a reference solution with DOLFINx alone.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from demos import greco_block as greco
 from demos import hertz, shrink_fit, sphere
 from fenics_contact import output
 from fenics_contact.elasticity import LinearElastic
-from scenes.elasticity import displacement_space, hold
-from scenes.tags import plane, sides
+from scenes.elasticity import dirichlet_bc, displacement_space
+from scenes.tags import plane, tag_by_nodes
 
-Parts = tuple[fem.Function, ufl.Form, fem.Constant, list[fem.DirichletBC]]
+ElasticityProblem = tuple[fem.Function, ufl.Form, fem.Constant, list[fem.DirichletBC]]
 
 
 @dataclass(frozen=True)
-class Body:
+class ContactScene:
     """An elastic body with its mesh, obstacle, boundary conditions and loads.
 
     Attributes:
@@ -40,21 +40,24 @@ class Body:
         E, nu, kind: Arguments of `LinearElastic`.
         friction: Friction coefficient μ.
         surface: Tag of Γc.
-        held: Pairs (component, tag) of displacement components that are fixed at zero.
-        end: Final value of the load parameter.
-        work: Virtual work of the loads (test function, load parameter, ds).
+        fixed_components: Pairs (component, tag) of displacement components that are fixed at zero.
+        final_load: Final value of the load parameter.
+        load_work: Virtual work of the loads (test function, load parameter, ds).
         contact: Function of the load parameter that returns the obstacle, and the gap if it is not
             given by the geometry, as arguments of `fc.Contact`.
         displacement: Function of u that returns the displacement to compare.
-        glued: Facets fixed in a linear solve, whose duration is the unit of time.
-        pressed: Virtual work of the loads of that solve (test function, ds), by default ``work``
-            at the end.
-        force: Approximate contact force, the scale of residuals (force).
+        linear_solve_fixed_facets: Facets fixed in a linear solve, whose duration is the unit of
+            time.
+        linear_solve_load_work: Virtual work of the loads of that solve (test function, ds), by
+            default ``load_work`` at the final load.
+        force_scale: Approximate contact force, the scale of residuals (force).
         h: Height of the cells at Γc; the reference form has k = stiffness E/h (length).
-        by_hand: Function of the position x and the load parameter that returns, for the reference
-            form, the normal from the body to the obstacle, the gap and the obstacle's motion (UFL).
-        push: Initial displacement of the reference Newton method, if it must start in contact.
-        history: Whether the result depends on the load increments.
+        reference_contact: Function of the position x and the load parameter that returns, for the
+            reference form, the normal from the body to the obstacle, the gap and the obstacle's
+            motion (UFL).
+        initial_displacement: Initial displacement of the reference Newton method, if it must start
+            in contact.
+        is_path_dependent: Whether the result depends on the load increments.
     """
 
     mesh: dolfinx.mesh.Mesh
@@ -64,18 +67,18 @@ class Body:
     kind: str
     friction: float
     surface: int
-    held: tuple[tuple[int, int], ...]
-    end: float
-    work: Callable[[Any, Any, ufl.Measure], Any]
+    fixed_components: tuple[tuple[int, int], ...]
+    final_load: float
+    load_work: Callable[[Any, Any, ufl.Measure], Any]
     contact: Callable[[Any], dict[str, Any]]
     displacement: Callable[[fem.Function], float]
-    glued: tuple[int, ...] = ()
-    pressed: Callable[[Any, ufl.Measure], Any] | None = None
-    force: float = 0.0
+    linear_solve_fixed_facets: tuple[int, ...] = ()
+    linear_solve_load_work: Callable[[Any, ufl.Measure], Any] | None = None
+    force_scale: float = 0.0
     h: float = 0.0
-    by_hand: Callable[[Any, Any], tuple[Any, Any, Any]] | None = None
-    push: tuple[float, ...] = ()
-    history: bool = False
+    reference_contact: Callable[[Any, Any], tuple[Any, Any, Any]] | None = None
+    initial_displacement: tuple[float, ...] = ()
+    is_path_dependent: bool = False
 
     @property
     def ds(self) -> ufl.Measure:
@@ -90,30 +93,35 @@ class Body:
 # ---- problem and reference form ------------------------------------------------------------------
 
 
-def parts(body: Body, degree: int) -> Parts:
+def elasticity_problem(body: ContactScene, degree: int) -> ElasticityProblem:
     """Return displacement, residual without contact, load parameter (0) and Dirichlet values."""
     space = displacement_space(body.mesh, degree)
     u, v = fem.Function(space), ufl.TestFunction(space)
     load = fem.Constant(body.mesh, PETSc.ScalarType(0.0))
     residual = body.elastic(u).residual(v)
-    residual -= body.work(v, load, body.ds)
-    return u, residual, load, [hold(u, body.tags, tag, i) for i, tag in body.held]
+    residual -= body.load_work(v, load, body.ds)
+    return (
+        u,
+        residual,
+        load,
+        [dirichlet_bc(u, body.tags, tag, i) for i, tag in body.fixed_components],
+    )
 
 
-def law(body: Body, stiffness: float) -> fc.Coulomb | fc.Frictionless:
+def law(body: ContactScene, stiffness: float) -> fc.Coulomb | fc.Frictionless:
     """Return the law, Coulomb's or frictionless, with k_n = k_t = ``stiffness`` E/h."""
     k = fc.RelativeStiffness(stiffness)
     return fc.Coulomb(body.friction, k_n=k, k_t=k) if body.friction else fc.Frictionless(k_n=k)
 
 
 def problem(
-    body: Body,
+    body: ContactScene,
     degree: int,
     stiffness: float | fc.Law,
     *,
-    made: Parts | None = None,
-    choices: Mapping[str, Any] | None = None,
-    rule: Mapping[str, Any] | None = None,
+    elasticity: ElasticityProblem | None = None,
+    contact_options: Mapping[str, Any] | None = None,
+    surface_options: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> tuple[fc.ContactProblem, fc.Contact, fem.Function, fem.Constant]:
     """Return this package's contact problem, its contact, displacement and load parameter (0).
@@ -122,20 +130,22 @@ def problem(
         body: The body.
         degree: Polynomial degree of the displacement.
         stiffness: k_n and k_t in units of E/h, or the law.
-        made: Result of `parts`, if it has been called already.
-        choices: More arguments of `fc.Contact`.
-        rule: Arguments of `fc.ContactSurface`, such as its quadrature.
+        elasticity: Result of `elasticity_problem`, if it has been called already.
+        contact_options: More arguments of `fc.Contact`.
+        surface_options: Arguments of `fc.ContactSurface`, such as its quadrature.
         **options: Arguments of `fc.ContactProblem`.
     """
-    u, residual, load, bcs = made or parts(body, degree)
-    surface = fc.ContactSurface(body.mesh, body.tags, body.surface, **(rule or {}))
+    u, residual, load, bcs = elasticity or elasticity_problem(body, degree)
+    surface = fc.ContactSurface(body.mesh, body.tags, body.surface, **(surface_options or {}))
     given = stiffness if isinstance(stiffness, fc.Law) else law(body, stiffness)
-    contact = fc.Contact(u, surface, law=given, **(choices or {}), **body.contact(load))
+    contact = fc.Contact(u, surface, law=given, **(contact_options or {}), **body.contact(load))
     problem = fc.ContactProblem(residual, u, bcs=bcs, contacts=[contact], **options)
     return problem, contact, u, load
 
 
-def penalty(body: Body, u: fem.Function, load: Any, stiffness: float) -> tuple[Any, Any]:
+def reference_penalty_traction(
+    body: ContactScene, u: fem.Function, load: Any, stiffness: float
+) -> tuple[Any, Any]:
     """Return pressure and traction on Γc of the reference penalty form for one increment (UFL).
 
     Args:
@@ -144,9 +154,9 @@ def penalty(body: Body, u: fem.Function, load: Any, stiffness: float) -> tuple[A
         load: The load parameter.
         stiffness: k_n and k_t in units of E/h.
     """
-    assert body.by_hand is not None
+    assert body.reference_contact is not None
     k = fem.Constant(body.mesh, stiffness * body.E / body.h)
-    n, gap, motion = body.by_hand(ufl.SpatialCoordinate(body.mesh), load)
+    n, gap, motion = body.reference_contact(ufl.SpatialCoordinate(body.mesh), load)
     pressure = k * ufl.max_value(ufl.dot(u, n) - gap, 0.0)
     if not body.friction:
         return pressure, -pressure * n
@@ -157,12 +167,12 @@ def penalty(body: Body, u: fem.Function, load: Any, stiffness: float) -> tuple[A
     return pressure, -pressure * n + ufl.conditional(ufl.lt(size, limit), 1.0, limit / size) * trial
 
 
-def count(space: fem.FunctionSpace) -> int:
+def n_dofs(space: fem.FunctionSpace) -> int:
     """Return the number of dofs on all ranks."""
     return int(space.dofmap.index_map.size_global * space.dofmap.bs)
 
 
-def count_on(space: fem.FunctionSpace, facets: np.ndarray) -> int:
+def n_facet_dofs(space: fem.FunctionSpace, facets: np.ndarray) -> int:
     """Return the number of dofs on the given facets of all ranks. Collective."""
     found = fem.locate_dofs_topological(space, space.mesh.topology.dim - 1, facets)
     owned = np.count_nonzero(found < space.dofmap.index_map.size_local)
@@ -173,7 +183,9 @@ def count_on(space: fem.FunctionSpace, facets: np.ndarray) -> int:
 
 
 @cache
-def half_cylinder(friction: float, h: float, *, smooth: bool = False, **growth: float) -> Body:
+def half_cylinder(
+    friction: float, h: float, *, smooth: bool = False, **growth: float
+) -> ContactScene:
     """Return the demo's half-cylinder on a plane.
 
     With ``smooth``, cells away from Γc are refined together with those on it; the error of the
@@ -183,7 +195,7 @@ def half_cylinder(friction: float, h: float, *, smooth: bool = False, **growth: 
     if smooth:
         growth = {"grading": min(0.3, 2.5 * h), "coarsest": min(hertz.R / 4, 12.5 * h)}
     mesh, tags = hertz.make_mesh(h, 1.3 * hertz.hertz(hertz.PAPER_LOAD)[0], **growth)
-    return Body(
+    return ContactScene(
         mesh=mesh,
         tags=tags,
         E=hertz.E,
@@ -191,26 +203,26 @@ def half_cylinder(friction: float, h: float, *, smooth: bool = False, **growth: 
         kind="plane strain",
         friction=friction,
         surface=hertz.CONTACT,
-        glued=(hertz.CONTACT,),
-        held=((0, hertz.AXIS),),
-        end=hertz.PAPER_LOAD,
-        work=lambda v, load, ds: -load * v[1] * ds(hertz.TOP),
+        linear_solve_fixed_facets=(hertz.CONTACT,),
+        fixed_components=((0, hertz.AXIS),),
+        final_load=hertz.PAPER_LOAD,
+        load_work=lambda v, load, ds: -load * v[1] * ds(hertz.TOP),
         contact=lambda load: {"obstacle": fc.HalfSpace((0, 0), (0, 1))},
         displacement=lambda u: float(output.at_node(u, (0.0, hertz.R))[1]),
-        force=hertz.R * hertz.PAPER_LOAD,
+        force_scale=hertz.R * hertz.PAPER_LOAD,
         h=h,
-        by_hand=_plane,
+        reference_contact=_reference_plane,
         # Only contact constrains the vertical rigid-body mode.
-        push=(0.0, -0.05),
-        history=friction > 0,
+        initial_displacement=(0.0, -0.05),
+        is_path_dependent=friction > 0,
     )
 
 
 @cache
-def greco_block(cells: int) -> Body:
+def greco_block(cells: int) -> ContactScene:
     """Return the demo's GRECO block; its displacement is u_x of the left bottom corner (µm)."""
     mesh, tags = greco.make_mesh(cells)
-    return Body(
+    return ContactScene(
         mesh=mesh,
         tags=tags,
         E=greco.E,
@@ -218,10 +230,10 @@ def greco_block(cells: int) -> Body:
         kind="plane strain",
         friction=greco.FRICTION,
         surface=greco.BOTTOM,
-        glued=(greco.BOTTOM,),
-        held=((0, greco.RIGHT),),
-        end=1.0,
-        work=lambda v, load, ds: (
+        linear_solve_fixed_facets=(greco.BOTTOM,),
+        fixed_components=((0, greco.RIGHT),),
+        final_load=1.0,
+        load_work=lambda v, load, ds: (
             load
             * (
                 greco.SIDE_PRESSURE * v[0] * ds(greco.LEFT)
@@ -230,24 +242,24 @@ def greco_block(cells: int) -> Body:
         ),
         contact=lambda load: {"obstacle": fc.HalfSpace((0, 0), (0, 1))},
         displacement=lambda u: 1e3 * float(output.at_node(u, (0.0, 0.0))[0]),
-        force=greco.SIZE * greco.TOP_PRESSURE,
+        force_scale=greco.SIZE * greco.TOP_PRESSURE,
         h=greco.SIZE / cells,
-        by_hand=_plane,
-        push=(0.0, -0.02),
+        reference_contact=_reference_plane,
+        initial_displacement=(0.0, -0.02),
     )
 
 
-def _plane(x: Any, load: Any) -> tuple[Any, Any, Any]:
+def _reference_plane(x: Any, load: Any) -> tuple[Any, Any, Any]:
     """Return normal, gap and motion of the fixed plane y = 0."""
     return ufl.as_vector([0, -1]), x[1], ufl.as_vector([0, 0])
 
 
 @cache
-def rings(h: float) -> Body:
+def rings(h: float) -> ContactScene:
     """Return the demo's shrink fit in plane strain; its displacement is u_x of the bore."""
     s = shrink_fit
     mesh, tags = s.make_mesh(h)
-    return Body(
+    return ContactScene(
         mesh=mesh,
         tags=tags,
         E=s.E,
@@ -255,12 +267,12 @@ def rings(h: float) -> Body:
         kind="plane strain",
         friction=0.0,
         surface=s.SHAFT,
-        held=((1, s.FLAT), (0, s.UPRIGHT)),
-        end=-s.OVERSIZE,
-        work=lambda v, load, ds: 0 * v[0] * ds(s.SHAFT),
+        fixed_components=((1, s.FLAT), (0, s.UPRIGHT)),
+        final_load=-s.OVERSIZE,
+        load_work=lambda v, load, ds: 0 * v[0] * ds(s.SHAFT),
         contact=lambda load: {"obstacle": fc.DeformableBody(tags, s.HUB), "gap": load},
         displacement=lambda u: float(output.at_node(u, (s.INNER, 0))[0]),
-        glued=(s.SHAFT, s.HUB),
+        linear_solve_fixed_facets=(s.SHAFT, s.HUB),
     )
 
 
@@ -268,14 +280,14 @@ def rings(h: float) -> Body:
 
 
 @cache
-def ball_on_half_space(cells: int) -> Body:
+def ball_on_half_space(cells: int) -> ContactScene:
     """Return the demo's frictionless ball on a block of tetrahedra, ``cells`` per contact radius.
 
     The displacement is u_z below the centre of the ball.
     """
     depth = 4e-4
     mesh, tags = sphere.make_mesh("block", np.sqrt(sphere.R * depth), cells)
-    return Body(
+    return ContactScene(
         mesh=mesh,
         tags=tags,
         E=sphere.E,
@@ -283,10 +295,14 @@ def ball_on_half_space(cells: int) -> Body:
         kind="3D",
         friction=0.0,
         surface=sphere.CONTACT,
-        glued=(sphere.CONTACT,),
-        held=((0, sphere.AT_X), (1, sphere.AT_Y), *((i, sphere.HELD) for i in range(3))),
-        end=-depth,
-        work=lambda v, load, ds: 0 * v[0] * ds(sphere.HELD),
+        linear_solve_fixed_facets=(sphere.CONTACT,),
+        fixed_components=(
+            (0, sphere.AT_X),
+            (1, sphere.AT_Y),
+            *((i, sphere.HELD) for i in range(3)),
+        ),
+        final_load=-depth,
+        load_work=lambda v, load, ds: 0 * v[0] * ds(sphere.HELD),
         contact=lambda load: _ball(sphere.R, load),
         displacement=lambda u: float(output.at_node(u, (0.0, 0.0, 0.0))[2]),
     )
@@ -295,11 +311,11 @@ def ball_on_half_space(cells: int) -> Body:
 # Radius and indentation depth of the ball: a = √(R d) = 0.1; the block has edges of length 1.
 RADIUS, DEPTH = 8.0, 1.25e-3
 WIDTH = 0.15  # width of Γc
-AT_X, AT_Y, AT_Z, FAR_X, FAR_Y, TOUCHING = range(1, 7)
+AT_X, AT_Y, AT_Z, FAR_X, FAR_Y, CONTACT = range(1, 7)
 
 
 @cache
-def ball_on_block(cells: int, friction: float = 0.3) -> Body:
+def ball_on_block(cells: int, friction: float = 0.3) -> ContactScene:
     """Return a rigid ball pressed on a quarter of a block of hexahedra, ``cells`` along each edge.
 
     Half of the cells of an edge lie on Γc, which is 1.5 contact radii wide, and are cubes. The far
@@ -309,7 +325,7 @@ def ball_on_block(cells: int, friction: float = 0.3) -> Body:
         MPI.COMM_WORLD, *(cells,) * 3, dolfinx.mesh.CellType.hexahedron
     )
     x = mesh.geometry.x
-    x[:] = np.interp(x, np.linspace(0, 1, cells + 1), graded(cells))
+    x[:] = np.interp(x, np.linspace(0, 1, cells + 1), graded_coordinates(cells))
     x[:, 2] *= -1
     where: dict[int, Any] = {
         AT_X: plane(0, 0.0),
@@ -318,25 +334,25 @@ def ball_on_block(cells: int, friction: float = 0.3) -> Body:
         FAR_X: plane(0, 1.0),
         FAR_Y: plane(1, 1.0),
     }
-    where[TOUCHING] = lambda x: np.isclose(x[2], 0) & (np.max(x[:2], axis=0) < WIDTH + 1e-9)
+    where[CONTACT] = lambda x: np.isclose(x[2], 0) & (np.max(x[:2], axis=0) < WIDTH + 1e-9)
     far = [(i, tag) for tag in (AT_Z, FAR_X, FAR_Y) for i in range(3)]
-    return Body(
+    return ContactScene(
         mesh=mesh,
-        tags=sides(mesh, where),
+        tags=tag_by_nodes(mesh, where),
         E=1.0,
         nu=0.3,
         kind="3D",
         friction=friction,
-        surface=TOUCHING,
-        held=((0, AT_X), (1, AT_Y), *far),
-        end=-DEPTH,
-        work=lambda v, load, ds: 0 * v[2] * ds(TOUCHING),
-        pressed=lambda v, ds: -v[2] * ds(TOUCHING),
+        surface=CONTACT,
+        fixed_components=((0, AT_X), (1, AT_Y), *far),
+        final_load=-DEPTH,
+        load_work=lambda v, load, ds: 0 * v[2] * ds(CONTACT),
+        linear_solve_load_work=lambda v, ds: -v[2] * ds(CONTACT),
         contact=lambda load: _ball(RADIUS, load),
         displacement=lambda u: float(output.at_node(u, (WIDTH, 0.0, 0.0))[2]),
-        force=hertz_force() / 4,
+        force_scale=hertz_force() / 4,
         h=WIDTH / (cells // 2),
-        by_hand=_by_hand_ball,
+        reference_contact=_reference_ball,
     )
 
 
@@ -345,7 +361,7 @@ TAGGED_RADIUS, TAGGED_DEPTH = 2.0, 0.01
 
 
 @cache
-def ball_on_tagged_block(cells: int, friction: float = 0.3) -> Body:
+def ball_on_tagged_block(cells: int, friction: float = 0.3) -> ContactScene:
     """Return a rigid ball pressed on a unit cube of tetrahedra, ``cells`` along each edge.
 
     Γc is the whole top, of which a sixteenth is in contact; the base is fixed. The displacement is
@@ -355,23 +371,23 @@ def ball_on_tagged_block(cells: int, friction: float = 0.3) -> Body:
         MPI.COMM_WORLD, [[-0.5, -0.5, -1.0], [0.5, 0.5, 0.0]], (cells,) * 3
     )
     force = 4 / 3 / (1 - 0.3**2) * np.sqrt(TAGGED_RADIUS) * TAGGED_DEPTH**1.5
-    return Body(
+    return ContactScene(
         mesh=mesh,
-        tags=sides(mesh, {AT_Z: plane(2, -1.0), TOUCHING: plane(2, 0.0)}),
+        tags=tag_by_nodes(mesh, {AT_Z: plane(2, -1.0), CONTACT: plane(2, 0.0)}),
         E=1.0,
         nu=0.3,
         kind="3D",
         friction=friction,
-        surface=TOUCHING,
-        held=tuple((i, AT_Z) for i in range(3)),
-        end=-TAGGED_DEPTH,
-        work=lambda v, load, ds: 0 * v[2] * ds(TOUCHING),
-        pressed=lambda v, ds: -v[2] * ds(TOUCHING),
+        surface=CONTACT,
+        fixed_components=tuple((i, AT_Z) for i in range(3)),
+        final_load=-TAGGED_DEPTH,
+        load_work=lambda v, load, ds: 0 * v[2] * ds(CONTACT),
+        linear_solve_load_work=lambda v, ds: -v[2] * ds(CONTACT),
         contact=lambda load: _ball(TAGGED_RADIUS, load),
         displacement=lambda u: float(output.at_node(u, (0.0, 0.0, 0.0))[2]),
-        force=force,
+        force_scale=force,
         h=1 / cells,
-        by_hand=lambda x, load: _by_hand_ball(x, load, TAGGED_RADIUS),
+        reference_contact=lambda x, load: _reference_ball(x, load, TAGGED_RADIUS),
     )
 
 
@@ -380,7 +396,7 @@ def hertz_force() -> float:
     return 4 / 3 / (1 - 0.3**2) * np.sqrt(RADIUS) * DEPTH**1.5
 
 
-def graded(cells: int) -> np.ndarray:
+def graded_coordinates(cells: int) -> np.ndarray:
     """Return node coordinates of an edge: equal cells on Γc, then growth by a constant factor."""
     near = cells // 2
     h, away = WIDTH / near, np.arange(1, cells - near + 1)
@@ -394,7 +410,7 @@ def _ball(radius: float, load: Any) -> dict[str, Any]:
     return {"obstacle": fc.Ball((0, 0, radius), radius, displacement=moved)}
 
 
-def _by_hand_ball(x: Any, load: Any, radius: float = RADIUS) -> tuple[Any, Any, Any]:
+def _reference_ball(x: Any, load: Any, radius: float = RADIUS) -> tuple[Any, Any, Any]:
     """Return normal, gap and motion of that ball for the reference form."""
     arm = ufl.as_vector([0, 0, radius + load]) - x
     distance = ufl.sqrt(ufl.dot(arm, arm))

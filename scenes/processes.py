@@ -12,27 +12,27 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def environment() -> dict[str, str]:
+def subprocess_environment() -> dict[str, str]:
     """Return the environment of a subprocess, without the variables of a surrounding mpirun.
 
     Environment variables allow more ranks than cores with Open MPI 6, 5 and 4; an option of mpirun
     would be an error with MPICH.
     """
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX"))}
-    kept.setdefault("PRTE_MCA_mapby", ":oversubscribe")
-    kept.setdefault("PRTE_MCA_rmaps_default_mapping_policy", ":oversubscribe")
-    kept.setdefault("OMPI_MCA_rmaps_base_oversubscribe", "1")
-    paths = [str(ROOT), *filter(None, [kept.get("PYTHONPATH")])]
-    return kept | {"PYTHONPATH": os.pathsep.join(paths)}
+    variables = {k: v for k, v in os.environ.items() if not k.startswith(("OMPI_COMM", "PMIX"))}
+    variables.setdefault("PRTE_MCA_mapby", ":oversubscribe")
+    variables.setdefault("PRTE_MCA_rmaps_default_mapping_policy", ":oversubscribe")
+    variables.setdefault("OMPI_MCA_rmaps_base_oversubscribe", "1")
+    paths = [str(ROOT), *filter(None, [variables.get("PYTHONPATH")])]
+    return variables | {"PYTHONPATH": os.pathsep.join(paths)}
 
 
-def command(ranks: int, *words: object) -> list[str]:
+def command(ranks: int, *arguments: object) -> list[str]:
     """Return the command that runs Python with these arguments on ``ranks`` ranks."""
     launch = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
-    return [*launch, sys.executable, *map(str, words)]
+    return [*launch, sys.executable, *map(str, arguments)]
 
 
-def answer(ranks: int, *words: object, seconds: float | None = None) -> Any:
+def run_json(ranks: int, *arguments: object, seconds: float | None = None) -> Any:
     """Run Python with these arguments on ``ranks`` ranks, and parse its last output line as JSON.
 
     Raises:
@@ -40,8 +40,8 @@ def answer(ranks: int, *words: object, seconds: float | None = None) -> Any:
         subprocess.TimeoutExpired: The process took more than ``seconds`` and was terminated.
     """
     done = subprocess.run(
-        command(ranks, *words),
-        env=environment(),
+        command(ranks, *arguments),
+        env=subprocess_environment(),
         stdout=subprocess.PIPE,
         text=True,
         check=True,
@@ -55,13 +55,15 @@ def run_demo(name: str, folder: Path, *options: str, ranks: int = 1) -> dict[str
 
     The demo must end with 0, and must not print a progress bar to stderr.
     """
-    words = command(ranks, ROOT / "demos" / f"{name}.py", *options, "--output", folder)
-    done = subprocess.run(words, env=environment(), capture_output=True, text=True, timeout=300)
+    arguments = command(ranks, ROOT / "demos" / f"{name}.py", *options, "--output", folder)
+    done = subprocess.run(
+        arguments, env=subprocess_environment(), capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "%|" not in done.stderr, "the progress bar must be silent when not on a terminal"
     return {"stdout": done.stdout} | json.loads(next(folder.glob("*.json")).read_text())
 
 
-def values(result: dict[str, Any]) -> dict[str, float]:
+def reference_values(result: dict[str, Any]) -> dict[str, float]:
     """Return a demo's values of all quantities that have references."""
     return {name: entry["value"] for name, entry in result["references"].items()}

@@ -16,13 +16,13 @@ import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic, NeoHookean
 from fenics_contact.types import Array
 from scenes.blocks import BOTTOM, TOP, block_mesh, dimension
-from scenes.comparing import at_points
+from scenes.comparison import point_values
 from scenes.elasticity import displacement_space, strain
 from scenes.histories import History
 from scenes.surfaces import ball, circle, ring
 
 # Compared results must not differ by the residual of the solver.
-TIGHT = {"snes_rtol": 1e-13}
+TIGHT_TOLERANCE = {"snes_rtol": 1e-13}
 # Mixed elements for displacement and pressure.
 MIXED = ("Taylor-Hood", "MINI")
 
@@ -35,7 +35,7 @@ class Rubber:
         u: Function that is solved for, with the pressure if the element is mixed.
         displacement: Displacement, an expression of u (UFL).
         F: Residual of the bulk.
-        held: Prescribed displacement of the bottom.
+        prescribed: Prescribed displacement of the bottom.
     """
 
     mesh: dolfinx.mesh.Mesh
@@ -44,7 +44,7 @@ class Rubber:
     displacement: Any
     body: NeoHookean | LinearElastic
     F: ufl.Form
-    held: fem.Function
+    prescribed: fem.Function
     bcs: list[fem.DirichletBC]
     height: float
 
@@ -53,10 +53,10 @@ class Rubber:
         """2 or 3."""
         return self.mesh.geometry.dim
 
-    def place(self, motion: Callable[[Array], Array]) -> None:
+    def move_bottom(self, motion: Callable[[Array], Array]) -> None:
         """Move the bottom by a map of positions (dim, n) to positions."""
         d = self.dim
-        self.held.interpolate(lambda x: motion(x[:d]) - x[:d])
+        self.prescribed.interpolate(lambda x: motion(x[:d]) - x[:d])
 
     def contact(
         self, obstacle: fc.Obstacle, law: Any, *, points_degree: int | None = None, **options: Any
@@ -107,11 +107,11 @@ def rubber(
     u = fem.Function(displacement_space(mesh, degree), name="u")
     options = {} if linear else {"isochoric": isochoric}
     body = (LinearElastic if linear else NeoHookean)(u, E, nu, kind, **options)
-    held = fem.Function(u.function_space)
+    prescribed = fem.Function(u.function_space)
     dofs = fem.locate_dofs_topological(u.function_space, d - 1, tags.find(BOTTOM))
-    bcs = [fem.dirichletbc(held, dofs)]
+    bcs = [fem.dirichletbc(prescribed, dofs)]
     F = body.residual(ufl.TestFunction(u.function_space), ufl.dx(mesh))
-    return Rubber(mesh, tags, u, u, body, F, held, bcs, float(size[-1]))
+    return Rubber(mesh, tags, u, u, body, F, prescribed, bcs, float(size[-1]))
 
 
 def mixed_space(mesh: dolfinx.mesh.Mesh, name: str) -> fem.FunctionSpace:
@@ -156,10 +156,10 @@ def _mixed(
     else:
         F = body.residual(v, dx, q=q)
     space, _ = W.sub(0).collapse()
-    held = fem.Function(space)
+    prescribed = fem.Function(space)
     dofs = fem.locate_dofs_topological((W.sub(0), space), tags.dim, tags.find(BOTTOM))
-    bcs = [fem.dirichletbc(held, dofs, W.sub(0))]
-    return Rubber(mesh, tags, w, u, body, F, held, bcs, height)
+    bcs = [fem.dirichletbc(prescribed, dofs, W.sub(0))]
+    return Rubber(mesh, tags, w, u, body, F, prescribed, bcs, height)
 
 
 SHAPES = ("ball", "profile", "facets")
@@ -184,24 +184,24 @@ def disc(
     """
     d = scene.dim
     centre = np.array((0.0,) * (d - 1) + (scene.height + radius,))
-    turn = None
+    rotation = None
     if angle is not None or moment is not None:
-        turn = fc.Rotation(angle, centre, None if d == 2 else axis, moment)
-    move = {"displacement": displacement, "rotation": turn}
+        rotation = fc.Rotation(angle, centre, None if d == 2 else axis, moment)
+    motion = {"displacement": displacement, "rotation": rotation}
     if shape == "ball":
-        return fc.Ball(centre, radius, **move)
+        return fc.Ball(centre, radius, **motion)
     if shape == "facets":
         if d == 2:
-            return fc.RigidSurface(circle(24, radius, centre), ring(24), **move)
-        return fc.RigidSurface(*ball(3, radius, centre), **move)
+            return fc.RigidSurface(circle(24, radius, centre), ring(24), **motion)
+        return fc.RigidSurface(*ball(3, radius, centre), **motion)
     if d == 2:
-        return fc.RigidProfile(circle(60, radius, centre), closed=True, **move)
+        return fc.RigidProfile(circle(60, radius, centre), closed=True, **motion)
     t = np.linspace(-np.pi / 2, np.pi / 2, 31)
     half = centre + radius * np.column_stack([np.cos(t), np.zeros(31), np.sin(t)])
-    return fc.RigidProfile(half, turned=(centre, (0, 0, 1)), **move)
+    return fc.RigidProfile(half, turned=(centre, (0, 0, 1)), **motion)
 
 
-class Tool(History):
+class DiscOnRubber(History):
     """A disc that is pressed into a block of rubber, dragged and rotated.
 
     Attributes:
@@ -215,8 +215,8 @@ class Tool(History):
         law: Any = None,
         radius: float = 0.8,
         contact: dict | None = None,
-        force: bool = False,
-        driven: bool = False,
+        by_force: bool = False,
+        by_moment: bool = False,
         shape: str = "ball",
         solver: dict | None = None,
         **options: Any,
@@ -228,8 +228,8 @@ class Tool(History):
             law: Contact law, by default Coulomb's.
             radius: Radius of the disc.
             contact: Arguments of `Rubber.contact`.
-            force: Whether the disc is pressed by a force, ``down``, instead of a displacement.
-            driven: Whether the disc is rotated by a ``moment`` instead of an angle.
+            by_force: Whether the disc is pressed by a force, ``down``, instead of a displacement.
+            by_moment: Whether the disc is rotated by a ``moment`` instead of an angle.
             shape: Shape of the disc, see `disc`.
             solver: Arguments of the problem.
             options: Arguments of `rubber`.
@@ -242,18 +242,18 @@ class Tool(History):
         self.down, self.side = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
         self.moment = fem.Constant(mesh, 0.0)
         motion: Any = self.shift
-        if force:
-            still = (0.0,) * (d - 2)
+        if by_force:
+            zeros = (0.0,) * (d - 2)
             motion = fc.Motion(
-                force=(*(None,) * (d - 1), self.down), displacement=(self.side, *still, None)
+                force=(*(None,) * (d - 1), self.down), displacement=(self.side, *zeros, None)
             )
-        turn = {"moment": self.moment} if driven else {"angle": self.angle}
-        obstacle = disc(self.scene, radius, displacement=motion, shape=shape, **turn)
+        rotation = {"moment": self.moment} if by_moment else {"angle": self.angle}
+        obstacle = disc(self.scene, radius, displacement=motion, shape=shape, **rotation)
         self.problem, self.contact = self.scene.problem(
             obstacle,
             law or fc.Coulomb(0.3, 1e4, 1e4),
             contact=contact,
-            **{"petsc_options": TIGHT, **(solver or {})},
+            **{"petsc_options": TIGHT_TOLERANCE, **(solver or {})},
         )
 
     def load(self, t: float) -> None:
@@ -270,7 +270,7 @@ class Tool(History):
         value[0], value[-1] = side, up
         return value
 
-    def go(self, side: float, up: float, angle: float = 0.0) -> fc.Step:
+    def solve_increment(self, side: float, up: float, angle: float = 0.0) -> fc.Step:
         """Solve and commit one increment with this displacement and angle of the disc."""
         self.shift.value[:], self.angle.value = self.vector(side, up), angle
         step = self.problem.solve()
@@ -283,10 +283,10 @@ class Tool(History):
 
     def tractions(self) -> Array:
         """Return the tractions at all points, ordered by their undeformed coordinates."""
-        return at_points(self.contact, self.contact.traction)
+        return point_values(self.contact, self.contact.traction)
 
 
-def domed(x):
+def bend_top(x):
     """Bend the top of a block [0, 2] x [0, 1] to a circle of radius 2 about (1, -1)."""
     top = np.sqrt(4 - (x[:, 0] - 1) ** 2) - 1
     return np.column_stack([x[:, 0], x[:, 1] * top])

@@ -12,8 +12,8 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.types import Array
 from scenes.bodies import Bodies, boxes
-from scenes.comparing import close, gathered
-from scenes.tags import Where, between, either, near
+from scenes.comparison import gather, is_close
+from scenes.tags import FacetSelector, any_of, at_coordinate, at_interface
 
 COMM = MPI.COMM_WORLD
 FLOOR, ROOF, LOWER, UPPER, WALL, SIDES, OUTSIDE = 1, 2, 3, 4, 5, 6, 9
@@ -28,12 +28,12 @@ def stack(
     heights: Sequence[float],
     *,
     widths: Sequence[float] | None = None,
-    apart: float = 0.0,
+    gap: float = 0.0,
     degree: int = 1,
     nu: float = 0.0,
-    tags: Mapping[int, Where] | None = None,
+    tags: Mapping[int, FacetSelector] | None = None,
 ) -> Bodies:
-    """Return stacked blocks with ``counts`` cells along x, and gaps of ``apart`` between them.
+    """Return stacked blocks with ``counts`` cells along x, and gaps of ``gap`` between them.
 
     Tags: FLOOR, ROOF, SIDES (all vertical faces), and 10 j + LOWER and 10 j + UPPER for the faces
     below and above joint j, numbered from 1 at the top of the lowest block.
@@ -46,22 +46,27 @@ def stack(
         up = np.linspace(low, low + height, max(1, round(n * height / width)) + 1)
         axes.append([across] * (d - 1) + [up])
         if j:
-            marks[10 * j + UPPER] = between(d - 1, low, above=True)
+            marks[10 * j + UPPER] = at_interface(d - 1, low, above=True)
         low += height
         if j + 1 < len(counts):
-            marks[10 * (j + 1) + LOWER] = between(d - 1, low, above=False)
-            low += apart
-    ends = [near(i, v) for i in range(d - 1) for v in (0.0, 1.0)]
-    marks = {FLOOR: near(d - 1, 0), ROOF: near(d - 1, low), SIDES: either(*ends), **marks}
+            marks[10 * (j + 1) + LOWER] = at_interface(d - 1, low, above=False)
+            low += gap
+    ends = [at_coordinate(i, v) for i in range(d - 1) for v in (0.0, 1.0)]
+    marks = {
+        FLOOR: at_coordinate(d - 1, 0),
+        ROOF: at_coordinate(d - 1, low),
+        SIDES: any_of(*ends),
+        **marks,
+    }
     made = boxes(axes, marks | (tags or {}), simplex=cell == "triangle")
     return Bodies(made, E, nu, degree=degree)
 
 
 def joint(body: Bodies, j: int, law: Any, *, swap: bool = False, **options: Any) -> fc.Contact:
     """Return the contact at joint ``j``; Γc is its upper face, or with ``swap`` its lower face."""
-    here, there = (LOWER, UPPER) if swap else (UPPER, LOWER)
+    slave, master = (LOWER, UPPER) if swap else (UPPER, LOWER)
     name = f"joint {j}"
-    return body.contact(10 * j + here, 10 * j + there, law, name=name, **options)
+    return body.contact(10 * j + slave, 10 * j + master, law, name=name, **options)
 
 
 def floor(body: Bodies, law: Any, tag: int = FLOOR, **options: Any) -> fc.Contact:
@@ -88,11 +93,11 @@ def rings(counts: tuple[int, int], *, degree: int = 2, angle: float = 1.5) -> Bo
         return np.column_stack([x[:, 1] * np.cos(x[:, 0]), x[:, 1] * np.sin(x[:, 0])])
 
     sides = {
-        LOWER: between(1, 20, above=False),
-        UPPER: between(1, 20, above=True),
-        FLOOR: near(0, 0),
-        ROOF: near(0, angle),
-        OUTSIDE: near(1, 40),
+        LOWER: at_interface(1, 20, above=False),
+        UPPER: at_interface(1, 20, above=True),
+        FLOOR: at_coordinate(0, 0),
+        ROOF: at_coordinate(0, angle),
+        OUTSIDE: at_coordinate(1, 40),
     }
     return Bodies(boxes(axes, sides, bend=bend, degree=degree), E, 0.3, degree=degree)
 
@@ -109,7 +114,7 @@ def nodal_forces(contact: fc.Contact) -> tuple[Array, Array]:
     return -force.x.array.reshape(-1, d)[:n], space.tabulate_dof_coordinates()[:n, :d]
 
 
-def balance(contact: fc.Contact) -> tuple[Array, float, float]:
+def force_resultants(contact: fc.Contact) -> tuple[Array, float, float]:
     """Return sums of nodal forces, their moments about the origin and component magnitudes."""
     f, x = nodal_forces(contact)
     i = contact.surface.mesh.geometry.dim - 1
@@ -121,7 +126,7 @@ def balance(contact: fc.Contact) -> tuple[Array, float, float]:
     )
 
 
-def uniform(values: Array, expected: float, rtol: float = 1e-9) -> bool:
+def is_uniform(values: Array, expected: float, rtol: float = 1e-9) -> bool:
     """Return whether all values equal ``expected`` within ``rtol``, on all ranks."""
-    values = gathered(COMM, values)
-    return close(values, np.full(values.shape, expected), rtol)
+    values = gather(COMM, values)
+    return is_close(values, np.full(values.shape, expected), rtol)

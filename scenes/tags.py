@@ -10,13 +10,13 @@ import numpy as np
 from fenics_contact.types import Array
 
 # Selects facets by the midpoints of the facets and of their cells, both (n, d).
-Where = Callable[[Array, Array], Array]
+FacetSelector = Callable[[Array, Array], Array]
 
 
 # ---- by nodes ------------------------------------------------------------------------------------
 
 
-def sides(
+def tag_by_nodes(
     mesh: dolfinx.mesh.Mesh, where: Mapping[int, Callable[[Array], Array]]
 ) -> dolfinx.mesh.MeshTags:
     """Return tags of the facets all of whose nodes (3, n) are selected. Collective."""
@@ -38,7 +38,9 @@ def plane(i: int, value: float) -> Callable[[Array], Array]:
 # ---- by midpoints --------------------------------------------------------------------------------
 
 
-def tagged(mesh: dolfinx.mesh.Mesh, where: Mapping[int, Where]) -> dolfinx.mesh.MeshTags:
+def tag_by_midpoints(
+    mesh: dolfinx.mesh.Mesh, where: Mapping[int, FacetSelector]
+) -> dolfinx.mesh.MeshTags:
     """Return tags of facets selected by midpoints; the last selector has priority. Collective."""
     d = mesh.topology.dim
     mesh.topology.create_connectivity(d - 1, d)
@@ -54,17 +56,17 @@ def tagged(mesh: dolfinx.mesh.Mesh, where: Mapping[int, Where]) -> dolfinx.mesh.
     return dolfinx.mesh.meshtags(mesh, d - 1, exterior[kept], values[kept])
 
 
-def near(i: int, value: float) -> Where:
+def at_coordinate(i: int, value: float) -> FacetSelector:
     """Return a selector of the facets whose midpoints have x_i = ``value``, within 1e-9."""
     return lambda x, cell: np.abs(x[:, i] - value) < 1e-9
 
 
-def between(i: int, value: float, *, above: bool) -> Where:
+def at_interface(i: int, value: float, *, above: bool) -> FacetSelector:
     """Return a selector of the facets at x_i = ``value`` whose cells are on one side of it."""
     side = 1 if above else -1
-    return lambda x, cell: near(i, value)(x, cell) & (side * (cell[:, i] - value) > 0)
+    return lambda x, cell: at_coordinate(i, value)(x, cell) & (side * (cell[:, i] - value) > 0)
 
 
-def either(*choices: Where) -> Where:
+def any_of(*choices: FacetSelector) -> FacetSelector:
     """Return a selector of the facets that at least one of the given selectors selects."""
     return lambda x, cell: np.any([choice(x, cell) for choice in choices], axis=0)

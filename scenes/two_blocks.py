@@ -14,11 +14,11 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact import compat
 from scenes.blocks import dimension
-from scenes.elasticity import displacement_space, hold, residual
-from scenes.meshes import mesh_of
-from scenes.tags import between, near, plane, sides, tagged
+from scenes.elasticity import dirichlet_bc, displacement_space, residual
+from scenes.meshes import create_mesh
+from scenes.tags import at_coordinate, at_interface, plane, tag_by_midpoints, tag_by_nodes
 
-BOTTOM, TOP, LOWER, UPPER = 1, 2, 3, 4
+BOTTOM, TOP, LOWER_FACE, UPPER_FACE = 1, 2, 3, 4
 E = 1e6
 
 
@@ -42,32 +42,32 @@ def two_blocks(
             x[-1][:, 1 : d - 1] += (widths[0] - width) / 2
         cells.append(compat.geometry_dofmap(block) + offset)
         offset += len(x[-1])
-    mesh = mesh_of(cell, np.concatenate(x), np.concatenate(cells))
+    mesh = create_mesh(cell, np.concatenate(x), np.concatenate(cells))
     up = d - 1
     faces = {
-        BOTTOM: near(up, 0.0),
-        TOP: near(up, 1.0),
-        LOWER: between(up, 0.5, above=False),
-        UPPER: between(up, 0.5, above=True),
+        BOTTOM: at_coordinate(up, 0.0),
+        TOP: at_coordinate(up, 1.0),
+        LOWER_FACE: at_interface(up, 0.5, above=False),
+        UPPER_FACE: at_interface(up, 0.5, above=True),
     }
-    return mesh, tagged(mesh, faces)
+    return mesh, tag_by_midpoints(mesh, faces)
 
 
-def pressed(
+def pressed_blocks(
     cell: str,
     degree: int,
     nu: float,
     law: Any,
     *,
     n: tuple[int, int] = (3, 4),
-    surface: int = LOWER,
-    confined: bool = True,
+    surface: int = LOWER_FACE,
+    laterally_fixed: bool = True,
     contact: dict | None = None,
     **options: Any,
 ) -> tuple[fc.ContactProblem, fc.Contact, fem.Constant]:
     """Return two blocks on rollers, pressed by 0.01, as problem, contact and load. Collective.
 
-    Both sides have zero normal displacement if ``confined``, otherwise those at 0 only.
+    Both sides have zero normal displacement if ``laterally_fixed``, otherwise those at 0 only.
     """
     mesh, tags = two_blocks(cell, n)
     d = mesh.geometry.dim
@@ -75,10 +75,14 @@ def pressed(
     u, v = fem.Function(space), ufl.TestFunction(space)
     down = fem.Constant(mesh, -0.01)
     ends = {10 * i + at: (i, at) for i in range(d - 1) for at in (0, 1)}
-    upright = sides(mesh, {tag: plane(i, at) for tag, (i, at) in ends.items()})
-    bcs = [hold(u, tags, BOTTOM, d - 1), hold(u, tags, TOP, d - 1, down)]
-    bcs += [hold(u, upright, tag, i) for tag, (i, at) in ends.items() if confined or at == 0]
-    opposite = UPPER if surface == LOWER else LOWER
+    upright = tag_by_nodes(mesh, {tag: plane(i, at) for tag, (i, at) in ends.items()})
+    bcs = [dirichlet_bc(u, tags, BOTTOM, d - 1), dirichlet_bc(u, tags, TOP, d - 1, down)]
+    bcs += [
+        dirichlet_bc(u, upright, tag, i)
+        for tag, (i, at) in ends.items()
+        if laterally_fixed or at == 0
+    ]
+    opposite = UPPER_FACE if surface == LOWER_FACE else LOWER_FACE
     made = fc.Contact(
         u,
         fc.ContactSurface(mesh, tags, surface),
@@ -90,12 +94,12 @@ def pressed(
     return problem, made, down
 
 
-class Slider:
+class SlidingBlock:
     """A block of width 1 at x = ``start`` on a block of width 4, with a prescribed top.
 
     Attributes:
         u: Displacement of both blocks.
-        move: Displacement of the top, one constant per component.
+        top_displacement: Displacement of the top, one constant per component.
         contact, problem: The contact and its problem.
     """
 
@@ -118,12 +122,18 @@ class Slider:
         mesh.geometry.x[:, d - 1] += slope * mesh.geometry.x[:, 0]
         space = displacement_space(mesh, 1)
         self.u, v = fem.Function(space), ufl.TestFunction(space)
-        self.move = [fem.Constant(mesh, 0.0) for _ in range(d)]
-        bcs = [hold(self.u, tags, BOTTOM, i) for i in range(d)]
-        bcs += [hold(self.u, tags, TOP, i, value) for i, value in enumerate(self.move)]
-        surface = fc.ContactSurface(mesh, tags, UPPER)
+        self.top_displacement = [fem.Constant(mesh, 0.0) for _ in range(d)]
+        bcs = [dirichlet_bc(self.u, tags, BOTTOM, i) for i in range(d)]
+        bcs += [
+            dirichlet_bc(self.u, tags, TOP, i, value)
+            for i, value in enumerate(self.top_displacement)
+        ]
+        surface = fc.ContactSurface(mesh, tags, UPPER_FACE)
         base = fc.DeformableBody(
-            tags, LOWER, update_pairs=update_pairs, max_initial_penetration=max_initial_penetration
+            tags,
+            LOWER_FACE,
+            update_pairs=update_pairs,
+            max_initial_penetration=max_initial_penetration,
         )
         self.contact = fc.Contact(self.u, surface, base, law, **(contact or {}))
         F = residual(self.u, v, E, 0.3)
@@ -131,7 +141,7 @@ class Slider:
 
     def step(self, down: float, along: float) -> fc.Step:
         """Set the displacement of the top, solve and commit."""
-        self.move[-1].value, self.move[0].value = -down, along
+        self.top_displacement[-1].value, self.top_displacement[0].value = -down, along
         step = self.problem.solve()
         self.problem.commit()
         return step

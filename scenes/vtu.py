@@ -13,7 +13,7 @@ from fenics_contact.types import Array
 
 
 @dataclass
-class Read:
+class VtuData:
     """The contents of a VTK file.
 
     Attributes:
@@ -31,14 +31,14 @@ class Read:
     numbers: dict[str, float]
 
 
-def series(path: Path) -> list[tuple[float, str]]:
+def read_collection(path: Path) -> list[tuple[float, str]]:
     """Return times and file names of a collection."""
     root = ElementTree.parse(path).getroot()
     assert root.tag == "VTKFile" and root.get("type") == "Collection"
     return [(float(e.get("timestep")), e.get("file")) for e in root.iter("DataSet")]
 
 
-def read(path: Path) -> Read:
+def read_vtu(path: Path) -> VtuData:
     """Read an unstructured grid of one piece."""
     root = ElementTree.parse(path).getroot()
     assert root.get("type") == "UnstructuredGrid" and root.get("header_type") == "UInt64"
@@ -56,7 +56,7 @@ def read(path: Path) -> Read:
     in_cells = _arrays(piece.find("CellData"))
     assert all(len(values) == n_cells for values in in_cells.values())
     numbers = _arrays(root.find(".//FieldData"))
-    return Read(
+    return VtuData(
         kind,
         x[nodes],
         {name: values[nodes] for name, values in at_nodes.items()},

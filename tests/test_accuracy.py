@@ -9,18 +9,18 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.contact.accuracy import DEFAULT_FACTOR, PRESETS
 from fenics_contact.estimates.errors import quantities
+from scenes.block_on_ball import ObliqueBlockOnBall, supporting_ball
 from scenes.blocks import TOP, block
-from scenes.comparing import raised_everywhere
+from scenes.comparison import assert_raised_on_all_ranks
 from scenes.elasticity import stress
-from scenes.rubbing import Aslant, cushion
 
 COMM = MPI.COMM_WORLD
 
 
-def press(law=None, **contact) -> Aslant:
+def press(law=None, **contact) -> ObliqueBlockOnBall:
     """Return a scene of quadratic cells, solved by Newton's method."""
     law = law or fc.Coulomb(0.3)
-    return Aslant(law, degree=2, mesh={"n": 8}, contact=contact, method="newton")
+    return ObliqueBlockOnBall(law, degree=2, mesh={"n": 8}, contact=contact, method="newton")
 
 
 @pytest.fixture(scope="module")
@@ -35,12 +35,12 @@ def truth():
     return quantities(made.problem)
 
 
-@pytest.mark.parametrize("wanted", [*PRESETS, 3e-3])
-def test_error_is_within_the_requested_accuracy(wanted, truth):
+@pytest.mark.parametrize("requested_accuracy", [*PRESETS, 3e-3])
+def test_error_is_within_the_requested_accuracy(requested_accuracy, truth):
     """Normal force, friction force and peak pressure have the requested error, on equal meshes."""
-    made = press(accuracy=wanted)
+    made = press(accuracy=requested_accuracy)
     steps = made.run()
-    accuracy = fc.Accuracy.of(wanted)
+    accuracy = fc.Accuracy.of(requested_accuracy)
     assert len(steps) == accuracy.increments
     found = quantities(made.problem)
     for name in ("normal force", "friction force", "peak pressure"):
@@ -106,28 +106,30 @@ def test_recommended_mesh_has_the_requested_error():
     The estimated rates are those of a contact zone that ends in the middle of cells; for a given
     mesh the error may be smaller or larger.
     """
-    wanted = 5e-3
-    made = press(fc.Frictionless(), accuracy=wanted)
+    requested_accuracy = 5e-3
+    made = press(fc.Frictionless(), accuracy=requested_accuracy)
     made.run()
     scene = made.scene
     budget = fc.estimate_errors(made.problem, stress(scene.u, scene.E, scene.nu))
-    assert budget.wanted == wanted
+    assert budget.wanted == requested_accuracy
     assert budget.h == pytest.approx(1 / 8, rel=1e-12)
     assert 0 < budget.h_wanted < budget.h
     assert "use facets" in str(budget)
     worst = max(budget.relative("discretisation").values())
     n = int(np.ceil(1 / budget.h_wanted))
     finer = block("quadrilateral", 2, n=n)
-    bcs = [finer.hold(TOP, 0, 0.015), finer.hold(TOP, 1, -0.03)]
-    contact = {"obstacle": cushion(2), "accuracy": wanted}
+    bcs = [finer.dirichlet_bc(TOP, 0, 0.015), finer.dirichlet_bc(TOP, 1, -0.03)]
+    contact = {"obstacle": supporting_ball(2), "accuracy": requested_accuracy}
     problem, _ = finer.problem(fc.Frictionless(), bcs, contact=contact, method="newton")
     problem.solve()
     again = fc.estimate_errors(problem, stress(finer.u, finer.E, finer.nu))
-    assert max(again.relative("discretisation").values()) < min(worst, 2 * wanted)
+    assert max(again.relative("discretisation").values()) < min(worst, 2 * requested_accuracy)
 
 
 @pytest.mark.whole
-@pytest.mark.parametrize("wanted", ["best", 0.0, -1.0, 2.0, float("nan"), [0.1, 0.2]])
-def test_wrong_accuracies_are_refused(wanted):
+@pytest.mark.parametrize("requested_accuracy", ["best", 0.0, -1.0, 2.0, float("nan"), [0.1, 0.2]])
+def test_wrong_accuracies_are_refused(requested_accuracy):
     """Unknown words and invalid errors are refused on all ranks, with a list of the choices."""
-    raised_everywhere(lambda: press(accuracy=wanted), ValueError, "standard", "between")
+    assert_raised_on_all_ranks(
+        lambda: press(accuracy=requested_accuracy), ValueError, "standard", "between"
+    )

@@ -14,8 +14,8 @@ from fenics_contact.parallel import global_sum
 from scenes.blocks import BOTTOM as INSIDE
 from scenes.blocks import TOP as OUTSIDE
 from scenes.blocks import block_mesh, side_tags
-from scenes.comparing import raised_everywhere
-from scenes.indented import AXIS, BASE, TOP, half_block, press
+from scenes.comparison import assert_raised_on_all_ranks
+from scenes.indented_block import AXIS, BASE, TOP, half_block, solve_indentation
 
 COMM = MPI.COMM_WORLD
 
@@ -34,8 +34,8 @@ def test_convergence_rate_of_the_energy_error():
     of a uniform mesh of 128 x 128 squares (3.494689) by at most three times the estimate. Less than
     a quarter of the dofs of the finest uniform mesh give the same energy error (measured: 1/7).
     """
-    adapted = list(fc.adapt(*half_block(4), press, levels=9))
-    uniform = list(fc.adapt(*half_block(4), press, levels=4, share=1.0))
+    adapted = list(fc.adapt(*half_block(4), solve_indentation, levels=9))
+    uniform = list(fc.adapt(*half_block(4), solve_indentation, levels=4, share=1.0))
     assert slope(adapted[1:]) == pytest.approx(-1.0, abs=0.15)
     assert slope(uniform) > -0.78
     as_good = next(a for a in adapted if a.budget.energy <= uniform[-1].budget.energy)
@@ -47,7 +47,7 @@ def test_convergence_rate_of_the_energy_error():
 
 def test_tags_and_increments_are_transferred_to_refined_meshes():
     """Tagged lengths agree to round-off (1e-12); each level solves all increments with friction."""
-    levels = list(fc.adapt(*half_block(4), lambda m, t: press(m, t, 0.3, 2), levels=3))
+    levels = list(fc.adapt(*half_block(4), lambda m, t: solve_indentation(m, t, 0.3, 2), levels=3))
     for level in levels:
         ds = ufl.Measure("ds", domain=level.mesh, subdomain_data=level.facet_tags)
         one = fem.Constant(level.mesh, 1.0)
@@ -96,10 +96,18 @@ def test_new_nodes_are_on_the_curved_side():
 def test_invalid_input_is_refused():
     """Unsupported cells or ghost modes and numbers out of range are refused on all ranks."""
     mesh, tags = block_mesh("quadrilateral")
-    raised_everywhere(lambda: list(fc.adapt(mesh, tags, press)), ValueError, "quadrilateral")
+    assert_raised_on_all_ranks(
+        lambda: list(fc.adapt(mesh, tags, solve_indentation)), ValueError, "quadrilateral"
+    )
     mesh, tags = half_block(2)
-    raised_everywhere(lambda: list(fc.adapt(mesh, tags, press, share=0.0)), ValueError, "share")
-    raised_everywhere(lambda: list(fc.adapt(mesh, tags, press, levels=0)), ValueError, "levels")
+    assert_raised_on_all_ranks(
+        lambda: list(fc.adapt(mesh, tags, solve_indentation, share=0.0)), ValueError, "share"
+    )
+    assert_raised_on_all_ranks(
+        lambda: list(fc.adapt(mesh, tags, solve_indentation, levels=0)), ValueError, "levels"
+    )
     mesh, tags = block_mesh("triangle", ghost_mode=GhostMode.shared_facet)
     if COMM.size > 1:
-        raised_everywhere(lambda: list(fc.adapt(mesh, tags, press)), ValueError, "GhostMode.none")
+        assert_raised_on_all_ranks(
+            lambda: list(fc.adapt(mesh, tags, solve_indentation)), ValueError, "GhostMode.none"
+        )

@@ -8,10 +8,15 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.results import drawing
+from scenes.block_on_ball import BlockOnBall
 from scenes.blocks import dimension
-from scenes.comparing import close, on_first, raised_everywhere, shared_folder
+from scenes.comparison import (
+    assert_raised_on_all_ranks,
+    check_on_first_rank,
+    is_close,
+    shared_folder,
+)
 from scenes.elasticity import stress
-from scenes.rubbing import Rub
 
 pytest.importorskip("matplotlib")
 Image = pytest.importorskip("PIL.Image")
@@ -22,7 +27,7 @@ pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 def rubbed(cell):
     """Return the problem of a block that is pressed and sheared, and the block's stress."""
-    made = Rub(cell=cell)
+    made = BlockOnBall(cell=cell)
     made.problem.small_displacement_tolerance = np.inf
     scene = made.scene
     if dimension(cell) == 3:
@@ -72,8 +77,8 @@ def test_every_frame_shows_one_state(cell, tmp_path, monkeypatch):
         largest = max(shape.stress.max() for shape in shapes)
         scale = colour_scale(0.0, largest)
         for shape, body, faces in zip(shapes, bodies, colours, strict=True):
-            assert close(body, shape.original + 2 * shape.displacement, 1e-14)
-            assert close(faces, scale.to_rgba(shape.stress), 1e-14)
+            assert is_close(body, shape.original + 2 * shape.displacement, 1e-14)
+            assert is_close(faces, scale.to_rgba(shape.stress), 1e-14)
         assert shapes[0].stress.max() < 0.9 * largest
         (places,) = axes
         everything = np.concatenate([body.reshape(-1, body.shape[2]) for body in bodies])
@@ -85,7 +90,7 @@ def test_every_frame_shows_one_state(cell, tmp_path, monkeypatch):
         told.append("rigid obstacle")
         assert [text.get_text() for text in legend.get_texts()] == told
 
-    on_first(check)
+    check_on_first_rank(check)
     del film
     gc.collect()
     COMM.barrier()
@@ -107,7 +112,7 @@ def test_invalid_input_is_refused(tmp_path):
         (lambda: fc.Animation(path, problem).save(), "add(step)"),
         (lambda: fc.Animation(path, problem).add(3), "state is 3"),
     ):
-        raised_everywhere(call, ValueError, *words)
+        assert_raised_on_all_ranks(call, ValueError, *words)
     COMM.barrier()
     assert not path.exists()
 
@@ -128,7 +133,7 @@ def test_failed_save_leaves_the_previous_file(tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(drawing, "polygons", failing)
-        raised_everywhere(film.save, OSError, "no more ink")
+        assert_raised_on_all_ranks(film.save, OSError, "no more ink")
     COMM.barrier()
     assert (folder / "film.gif").read_bytes() == before
     assert [p for p in folder.iterdir() if p.suffix == ".gif"] == [folder / "film.gif"]

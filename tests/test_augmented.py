@@ -15,8 +15,8 @@ from fenics_contact import checkpoint
 from fenics_contact.elasticity import LinearElastic
 from fenics_contact.parallel import global_sum
 from scenes import problems, two_blocks
-from scenes.blocks import FRONT, GRID, LEFT, TOP, block, bulge, wave
-from scenes.comparing import at_points, close, gathered, nodal, shared_folder
+from scenes.blocks import FRONT, GRID, LEFT, TOP, block, parabolic_floor, rough_field
+from scenes.comparison import gather, is_close, nodal_values, point_values, shared_folder
 
 COMM = MPI.COMM_WORLD
 E = 1000.0
@@ -28,7 +28,7 @@ AUGMENTED = {"enforcement": "augmented"}
 
 
 def values(contact: fc.Contact, name: str) -> np.ndarray:
-    return gathered(COMM, contact.values.arrays[name])
+    return gather(COMM, contact.values.arrays[name])
 
 
 # ---- patch tests ---------------------------------------------------------------------------------
@@ -50,9 +50,9 @@ def test_patch(cell: str, degree: int) -> None:
         petsc_options={"snes_rtol": 1e-12},
     )
     step = problem.solve()
-    pressure = gathered(COMM, contact.pressure)
-    assert close(pressure, np.full_like(pressure, p), 1e-9)
-    assert np.abs(gathered(COMM, contact.gap)).max() <= 1e-9 * p / k_n
+    pressure = gather(COMM, contact.pressure)
+    assert is_close(pressure, np.full_like(pressure, p), 1e-9)
+    assert np.abs(gather(COMM, contact.gap)).max() <= 1e-9 * p / k_n
     assert step.augmentations <= 3
     assert step.verdict.enforcement["contact"] <= 1e-9 and not step.verdict.failures
     # The springs have no force: their energy is the square of round-off.
@@ -68,7 +68,7 @@ def test_patch_of_two_bodies(cell: str, degree: int) -> None:
     augmentation leaves M/(M + k_n) = 1/8 of the jump.
     """
     nu, k_n = 0.3, 1e7
-    problem, contact, _ = two_blocks.pressed(
+    problem, contact, _ = two_blocks.pressed_blocks(
         cell, degree, nu, fc.Coulomb(0.3, k_n, k_n), contact=AUGMENTED | {"tolerance": 1e-8}
     )
     problem.solve()
@@ -101,7 +101,7 @@ def walk(law: str, stiffness: fc.RelativeStiffness, path=PATH, **options):
     scene = block(cell, 1, n=n, surface={"quadrature_scheme": "vertex"})
     move = fem.Constant(scene.mesh, np.zeros(d))
     bcs = [fem.dirichletbc(move, scene.facet_dofs(TOP), scene.u.function_space)]
-    contact = {"obstacle": bulge(scene), **options}
+    contact = {"obstacle": parabolic_floor(scene), **options}
     problem, contact = scene.problem(make(stiffness), bcs, contact=contact, method="newton")
     found = []
     for side, down in path:
@@ -111,7 +111,7 @@ def walk(law: str, stiffness: fc.RelativeStiffness, path=PATH, **options):
         step = problem.solve()
         problem.commit()
         fields = contact.traction, contact.slip
-        found.append((step, *(at_points(contact, f) for f in fields)))
+        found.append((step, *(point_values(contact, f) for f in fields)))
     return found, contact
 
 
@@ -153,8 +153,8 @@ def test_half_cylinder() -> None:
     body = problems.half_cylinder(0.0, 0.1, grading=0.1, coarsest=0.5)
     found = []
     for k, options in ((10.0, {}), (10.0, AUGMENTED), (1e6, {})):
-        problem, _, u, load = problems.problem(body, 2, k, choices=options)
-        load.value = body.end
+        problem, _, u, load = problems.problem(body, 2, k, contact_options=options)
+        load.value = body.final_load
         step = problem.solve()
         found.append((body.displacement(u), step.contacts["contact"].max_pressure, step.iterations))
     penalty, augmented, rigid = found
@@ -181,7 +181,7 @@ def test_default_quadrature_of_multipliers(degree: int) -> None:
         contact.evaluate()
         per_facet = COMM.allreduce(len(contact.points)) / COMM.allreduce(len(scene.surface.facets))
         assert per_facet == wanted
-        corner = np.abs(gathered(COMM, contact.points)[:, 0]).min() < 1e-12
+        corner = np.abs(gather(COMM, contact.points)[:, 0]).min() < 1e-12
         assert corner == (not given and bool(options) and degree == 1)
 
 
@@ -207,9 +207,9 @@ def test_cyclic_shear_below_the_friction_bound_leaves_no_slip(degree: int) -> No
         scene.load(up=-10.0, side=np.cos(i))
         problem.solve()
         problem.commit()
-        moved.append(np.abs(gathered(COMM, contact.tangential_displacement)).max())
-        felt.append(np.abs(gathered(COMM, contact.tangential_traction)).max())
-        assert np.all(gathered(COMM, contact.status) == fc.Status.STICK)
+        moved.append(np.abs(gather(COMM, contact.tangential_displacement)).max())
+        felt.append(np.abs(gather(COMM, contact.tangential_traction)).max())
+        assert np.all(gather(COMM, contact.status) == fc.Status.STICK)
     assert max(felt) > 0.9
     assert max(moved) <= (2 * 1e-5 * 16.0 if degree == 1 else 0.05 * max(felt)) / k_t
     assert max(moved[6:]) <= 1.5 * max(moved[:6])
@@ -234,8 +234,8 @@ def test_solving_a_committed_state_again_causes_no_creep() -> None:
     problem.commit()
     step = problem.solve()
     assert step.augmentations <= 2
-    assert close(gathered(COMM, contact.traction), gathered(COMM, before), 1e-4)
-    assert np.abs(gathered(COMM, contact.slip_increment)).max() <= 1e-4 * 1.0 / E
+    assert is_close(gather(COMM, contact.traction), gather(COMM, before), 1e-4)
+    assert np.abs(gather(COMM, contact.slip_increment)).max() <= 1e-4 * 1.0 / E
 
 
 # ---- forms, obstacles, ranks, files --------------------------------------------------------------
@@ -254,19 +254,19 @@ def test_force_and_tangent_with_multipliers(law: str) -> None:
     scene = block(cell, 2, n=2, shuffled=True)
     contact = scene.contact(make(fc.RelativeStiffness(3.0)), modulus=E, **AUGMENTED)
     rows = contact.multipliers.fields.rows()
-    rough = wave(d, 3)(contact.points.T).T
+    rough = rough_field(d, 3)(contact.points.T).T
     rows[:, 0] = 0.01 * E * np.abs(rough[:, 0])
     rows[:, 1:] = 0.01 * E * rough[:, : rows.shape[1] - 1]
     contact.multipliers.fields.set_rows(rows)
     u, size = scene.u, 0.02
-    base, way = fem.Function(u.function_space), fem.Function(u.function_space)
-    base.interpolate(lambda x: size * wave(d, 1)(x))
-    way.interpolate(wave(d, 2))
+    base, direction = fem.Function(u.function_space), fem.Function(u.function_space)
+    base.interpolate(lambda x: size * rough_field(d, 1)(x))
+    direction.interpolate(rough_field(d, 2))
     n = u.function_space.dofmap.index_map.size_local * d
     operator = fc.ContactOperator(contact)
 
     def at(t: float) -> tuple[np.ndarray, float]:
-        u.x.array[:] = base.x.array + t * way.x.array
+        u.x.array[:] = base.x.array + t * direction.x.array
         force = operator.unknowns.vector()
         operator.add_force(force)
         energy = COMM.allreduce(contact.energy()) if contact.law.has_potential else 0.0
@@ -277,11 +277,11 @@ def test_force_and_tangent_with_multipliers(law: str) -> None:
     force, _ = at(0.0)
     tangent = operator.tangent()
     right, left = tangent.createVecs()
-    right.array[:] = way.x.array[:n]
+    right.array[:] = direction.x.array[:n]
     tangent.mult(right, left)
-    assert close(gathered(COMM, (f1 - f0) / (2 * step)), gathered(COMM, left.array), 1e-6)
+    assert is_close(gather(COMM, (f1 - f0) / (2 * step)), gather(COMM, left.array), 1e-6)
     if contact.law.has_potential:
-        power = COMM.allreduce(float(force @ way.x.array[:n]))
+        power = COMM.allreduce(float(force @ direction.x.array[:n]))
         assert (e1 - e0) / (2 * step) == pytest.approx(power, rel=1e-6)
 
 
@@ -301,7 +301,7 @@ def test_augmentation_with_very_soft_springs(degree: int) -> None:
         scene = block("quadrilateral", degree, n=6)
         shift = fem.Constant(scene.mesh, np.zeros(2))
         law = fc.Coulomb(0.3, k_n=fc.RelativeStiffness(k), k_t=fc.RelativeStiffness(k))
-        held = [scene.hold(TOP, i) for i in range(2)]
+        held = [scene.dirichlet_bc(TOP, i) for i in range(2)]
         given = AUGMENTED | {"displacement": shift}
         problem, contact = scene.problem(law, held, contact=given)
         for side in (0.0, 0.004, -0.004):
@@ -311,7 +311,7 @@ def test_augmentation_with_very_soft_springs(degree: int) -> None:
             assert step.augmentations <= 60
             forces.append(contact.resultants().force)
         assert contact.resultants().slip > 0
-    assert close(np.array(forces[:3]), np.array(forces[3:]), 1e-4 if degree == 1 else 2e-3)
+    assert is_close(np.array(forces[:3]), np.array(forces[3:]), 1e-4 if degree == 1 else 2e-3)
 
 
 @pytest.mark.two_ranks
@@ -348,7 +348,7 @@ def test_block_in_corner_of_floor_and_wall(
         obstacle = fc.HalfSpace((-gap, 0.0, 0.0), (1.0, 0.0, 0.0))
         surface = fc.ContactSurface(scene.mesh, scene.tags, LEFT)
         wall = fc.Contact(scene.u, surface, obstacle, laws[1], name="wall", **given)
-        held = [scene.hold(FRONT, 1)]
+        held = [scene.dirichlet_bc(FRONT, 1)]
         problem = fc.ContactProblem(scene.F, scene.u, bcs=held, contacts=[floor, wall])
         for share in (1 / 3, 2 / 3, 1.0, 0.8, 0.6, 0.4, 0.2):
             side, up = (-share * part for part in load)
@@ -356,9 +356,9 @@ def test_block_in_corner_of_floor_and_wall(
             problem.solve()
             problem.commit()
             force = sum(contact.resultants().force for contact in (floor, wall))
-            assert close(force[[0, 2]], [-side, -up], 1e-8 if given else 1e-7)
-        displacements.append(nodal(scene.u))
-    assert close(*displacements, 0.02)
+            assert is_close(force[[0, 2]], [-side, -up], 1e-8 if given else 1e-7)
+        displacements.append(nodal_values(scene.u))
+    assert is_close(*displacements, 0.02)
 
 
 def test_augment_called_directly_gives_the_same_multipliers() -> None:
@@ -367,7 +367,9 @@ def test_augment_called_directly_gives_the_same_multipliers() -> None:
     for by_hand in (False, True):
         scene = block("quadrilateral", 1, n=4, up=-10.0)
         problem, contact = scene.problem(
-            fc.Frictionless(), scene.rollers(), contact={"obstacle": bulge(scene)} | AUGMENTED
+            fc.Frictionless(),
+            scene.rollers(),
+            contact={"obstacle": parabolic_floor(scene)} | AUGMENTED,
         )
         if by_hand:
             contact.tolerance = 0.999  # one augmentation per solve
@@ -378,8 +380,8 @@ def test_augment_called_directly_gives_the_same_multipliers() -> None:
             assert errors[0] > 1e-3 and errors[-1] <= 1e-5
         else:
             problem.solve()
-        made.append(gathered(COMM, contact.pressure))
-    assert close(made[1], made[0], 1e-4)
+        made.append(gather(COMM, contact.pressure))
+    assert is_close(made[1], made[0], 1e-4)
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="of the condensed problem; ranks are compared below")
@@ -394,7 +396,7 @@ def test_sliding_over_nonmatching_facets() -> None:
     normal = []
     for k, options in ((10.0, AUGMENTED), (1e4, {}), (10.0, {})):
         law = fc.Coulomb(0.3, fc.RelativeStiffness(k), fc.RelativeStiffness(k))
-        made = two_blocks.Slider("triangle", law, start=0.4, contact=options, method="newton")
+        made = two_blocks.SlidingBlock("triangle", law, start=0.4, contact=options, method="newton")
         steps = [made.step(0.01, 0.0), *(made.step(0.01, 0.1 * i) for i in range(1, 6))]
         last = steps[-1].contacts["contact"]
         assert last.tangential_force == pytest.approx(0.3 * last.normal_force, rel=1e-6)
@@ -411,7 +413,7 @@ def test_obstacle_moved_by_a_force() -> None:
     """
     scene = block("quadrilateral", 1, nu=0.0)
     motion = fc.Motion(force=(None, 10.0), displacement=(0.0, None))
-    bcs = [scene.hold(TOP, 1), *scene.rollers()]
+    bcs = [scene.dirichlet_bc(TOP, 1), *scene.rollers()]
     problem, contact = scene.problem(
         fc.Coulomb(0.3, k_n=1e4, k_t=1e4),
         bcs,
@@ -428,11 +430,11 @@ def test_multipliers_do_not_depend_on_the_number_of_ranks() -> None:
     for comm in (COMM, MPI.COMM_SELF):
         scene = block("triangle", 2, n=6, up=-10.0, side=1.0, comm=comm)
         law = fc.Coulomb(0.3)
-        contact = {"obstacle": bulge(scene), "tolerance": 1e-6} | AUGMENTED
-        problem, contact = scene.problem(law, [scene.hold(TOP, 0, 0.001)], contact=contact)
+        contact = {"obstacle": parabolic_floor(scene), "tolerance": 1e-6} | AUGMENTED
+        problem, contact = scene.problem(law, [scene.dirichlet_bc(TOP, 0, 0.001)], contact=contact)
         problem.solve()
-        found.append(at_points(contact, contact.traction))
-    assert close(found[0], found[1], 1e-5)
+        found.append(point_values(contact, contact.traction))
+    assert is_close(found[0], found[1], 1e-5)
 
 
 def test_restart_from_checkpoint_with_multipliers(tmp_path: Path) -> None:
@@ -456,8 +458,8 @@ def test_restart_from_checkpoint_with_multipliers(tmp_path: Path) -> None:
             checkpoint.save(problem, folder / "state.npz")
         scene.load(up=-10.0, side=2.0)
         problem.solve()
-        made.append(at_points(contact, contact.traction))
-    assert close(made[1], made[0], 1e-9)
+        made.append(point_values(contact, contact.traction))
+    assert is_close(made[1], made[0], 1e-9)
 
 
 @pytest.mark.parametrize("k", [10.0, 100.0])
@@ -526,7 +528,7 @@ def test_reloading_an_unconstrained_body_after_complete_unloading(cell):
         problem.solve()
         problem.commit()
         force = contact.resultants().force
-        assert close(force, scene.vector(up=-up), 1e-9, scale=10.0)
+        assert is_close(force, scene.vector(up=-up), 1e-9, scale=10.0)
         found.append(values(contact, "normal_traction"))
     assert not found[1].any()
-    assert close(found[2], found[0], 1e-4)
+    assert is_close(found[2], found[0], 1e-4)

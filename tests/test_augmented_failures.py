@@ -8,8 +8,8 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.methods import augmented_lagrangian as module
-from scenes.blocks import RIGHT, TOP, block, bulge
-from scenes.comparing import raised_everywhere
+from scenes.blocks import RIGHT, TOP, block, parabolic_floor
+from scenes.comparison import assert_raised_on_all_ranks
 from scenes.rubber import rubber
 
 COMM = MPI.COMM_WORLD
@@ -26,7 +26,9 @@ def test_failure_leaves_no_trace(what: str, monkeypatch: pytest.MonkeyPatch) -> 
     """Too few iterations or augmentations leave u, history and multipliers bitwise unchanged."""
     scene = block("quadrilateral", 1, n=4, up=-10.0)
     problem, contact = scene.problem(
-        fc.Coulomb(0.3, k_n=1e4, k_t=1e4), [], contact={"obstacle": bulge(scene)} | AUGMENTED
+        fc.Coulomb(0.3, k_n=1e4, k_t=1e4),
+        [],
+        contact={"obstacle": parabolic_floor(scene)} | AUGMENTED,
     )
     problem.solve()
     problem.commit()
@@ -46,7 +48,7 @@ def test_failure_leaves_no_trace(what: str, monkeypatch: pytest.MonkeyPatch) -> 
     words = (
         ("augmented Lagrangian method has not converged",) if what == "rounds" else ("increment 2",)
     )
-    raised_everywhere(problem.solve, fc.NotConverged, *words)
+    assert_raised_on_all_ranks(problem.solve, fc.NotConverged, *words)
     assert all(np.array_equal(a, b) for a, b in zip(before, state(), strict=True))
     monkeypatch.undo()
 
@@ -68,14 +70,14 @@ def test_invalid_arguments_are_refused(case: str) -> None:
     options, law, words = BAD[case]
     scene = block("quadrilateral", 1, surface={"quadrature_scheme": "vertex"})
     call = lambda: scene.contact(law, **(AUGMENTED | options))  # noqa: E731
-    raised_everywhere(call, ValueError, "contact", *words)
+    assert_raised_on_all_ranks(call, ValueError, "contact", *words)
 
 
 def test_penalty_has_no_multipliers() -> None:
     """`augment` is refused for the penalty, which has no multipliers."""
     scene = block("quadrilateral", 1)
     contact = scene.contact(fc.Frictionless(k_n=1e3))
-    raised_everywhere(contact.augment, ValueError, "augmented")
+    assert_raised_on_all_ranks(contact.augment, ValueError, "augmented")
     assert contact.multipliers is None
 
 
@@ -118,7 +120,7 @@ def test_dirichlet_node_inside_the_obstacle_is_refused(kinematics, method):
     with the penalty, the problem is solved.
     """
     found = []
-    for enforcement, way in (("augmented", 0.02), ("augmented", -0.02), ("penalty", 0.02)):
+    for enforcement, displacement in (("augmented", 0.02), ("augmented", -0.02), ("penalty", 0.02)):
         scene = rubber("quadrilateral", 1, n=(4, 4), linear=True)
         surface = fc.ContactSurface(scene.mesh, scene.tags, RIGHT)
         wall = fc.HalfSpace((1.0, 0.0), (-1.0, 0.0))
@@ -132,8 +134,10 @@ def test_dirichlet_node_inside_the_obstacle_is_refused(kinematics, method):
             method=method,
             small_displacement_tolerance=np.inf,
         )
-        scene.place(lambda x, way=way: x + np.array([[way], [0.0]]))
-        if enforcement == "augmented" and way > 0:
+        scene.move_bottom(
+            lambda x, displacement=displacement: x + np.array([[displacement], [0.0]])
+        )
+        if enforcement == "augmented" and displacement > 0:
             with pytest.raises(
                 fc.NotConverged, match="prescribes a node of Γc inside of the obstacle"
             ):

@@ -8,7 +8,7 @@ import pytest
 import fenics_contact as fc
 from scenes.blocks import block
 from scenes.bodies import Bodies, boxes
-from scenes.comparing import close, nodal
+from scenes.comparison import is_close, nodal_values
 
 HEAVY, LIGHT, TOP, LIGHT_TOP = 1, 2, 3, 4
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
@@ -37,12 +37,12 @@ def test_unloading_takes_at_most_twice_the_iterations_of_loading(cell, friction,
             iterations.append(problem.solve().iterations)
             problem.commit()
         assert contact.resultants().force[-1] == pytest.approx(loads[-1], rel=1e-8)
-        return iterations, nodal(scene.u)
+        return iterations, nodal_values(scene.u)
 
     (rise, fall), u = found(10.0, 10.0 * share)
     assert fall <= 2 * rise
     if not friction:
-        assert close(u, found(10.0 * share)[1], 1e-4)
+        assert is_close(u, found(10.0 * share)[1], 1e-4)
 
 
 def test_unloading_of_one_body_with_constant_load_on_another():

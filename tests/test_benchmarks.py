@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 from benchmarks import costs, page, run, timing
 from scenes import problems
-from scenes.processes import ROOT, environment
+from scenes.processes import ROOT, subprocess_environment
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="of one process")
 
@@ -37,7 +37,9 @@ def test_short_benchmark(name: str, tmp_path: Path) -> None:
     """The short benchmark succeeds and every method finds the solution."""
     command = [sys.executable, str(ROOT / "benchmarks" / "run.py"), name, "--short"]
     command += ["--repeat", "1", "--output", str(tmp_path)]
-    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=900)
+    done = subprocess.run(
+        command, env=subprocess_environment(), capture_output=True, text=True, timeout=900
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "targets were not measured" in (tmp_path / "README.md").read_text()
     with open(tmp_path / name / f"{name}_sizes.csv", newline="") as file:
@@ -51,7 +53,9 @@ def test_bolted_joint_runs(tmp_path: Path) -> None:
     """Every increment is solved on one and two ranks, and the overload is refused."""
     command = [sys.executable, str(ROOT / "benchmarks" / "bolted_joint.py"), "--short"]
     command += ["--repeat", "1", "--output", str(tmp_path)]
-    done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=900)
+    done = subprocess.run(
+        command, env=subprocess_environment(), capture_output=True, text=True, timeout=900
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     with open(tmp_path / "bolted_joint.csv", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -80,7 +84,7 @@ def test_contact_at_large_strains_takes_few_newton_iterations(tmp_path: Path) ->
     """
     command = [sys.executable, str(ROOT / "benchmarks" / "finite.py"), "--short"]
     subprocess.run(
-        [*command, "--output", str(tmp_path)], check=True, env=environment(), timeout=120
+        [*command, "--output", str(tmp_path)], check=True, env=subprocess_environment(), timeout=120
     )
     with open(tmp_path / "finite.csv", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["run"] == "contact"]

@@ -6,7 +6,7 @@ import pytest
 
 import fenics_contact as fc
 from scenes.bolted_joint import FRICTION, BoltedJoint
-from scenes.comparing import raised_everywhere
+from scenes.comparison import assert_raised_on_all_ranks
 
 pytestmark = pytest.mark.two_ranks
 
@@ -44,7 +44,7 @@ def test_tightened_joint_is_pulled_to_the_friction_limit() -> None:
             failed.append(error)
             raise
 
-    raised_everywhere(solve, fc.NotConverged, words)
+    assert_raised_on_all_ranks(solve, fc.NotConverged, words)
     # In the first augmentation the last method detects the overload, in 10 iterations; in the
     # second it is the only one, with 11. How many times L-BFGS makes 20 iterations before depends
     # on round-off.

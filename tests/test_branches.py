@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.blocks import LEFT, RIGHT, block
-from scenes.comparing import close
+from scenes.comparison import is_close
 
 COMM = MPI.COMM_WORLD
 PRESS = 10.0
@@ -66,7 +66,7 @@ def test_locked_wedge_keeps_its_forces(method):
     expected, steps = released(8)
     assert len(steps) == 8 and np.all(expected > 5.0)
     found, _ = released(1, method=method)
-    assert close(found, expected, 0.02)
+    assert is_close(found, expected, 0.02)
 
 
 @pytest.mark.each
@@ -94,7 +94,7 @@ def test_locked_wedge_without_load_is_not_taken_for_unloaded(pull, method):
         assert len(pulled) == steps  # no increment was cut
         forces.append([c.resultants().normal_force for c in contacts])
     assert min(forces[1]) > 5.0
-    assert close(np.array(forces[0]), np.array(forces[1]), 0.02)
+    assert is_close(np.array(forces[0]), np.array(forces[1]), 0.02)
 
 
 def test_ejected_wedge_is_refused():
@@ -110,7 +110,7 @@ def test_ejected_wedge_is_refused():
         with pytest.raises(fc.NotConverged, match="friction supplies energy"):
             problem.solve()
     for contact, rows in zip(contacts, before, strict=True):
-        assert close(contact.history.rows(), rows, 0.0)
+        assert is_close(contact.history.rows(), rows, 0.0)
 
 
 def test_friction_supplies_at_most_one_percent_of_the_energy():

@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.blocks import block
-from scenes.comparing import at_points, close, nodal, raised_everywhere
+from scenes.comparison import assert_raised_on_all_ranks, is_close, nodal_values, point_values
 from scenes.stacks import FLOOR, LOWER, ROOF, UPPER, stack
 
 COMM = MPI.COMM_WORLD
@@ -19,28 +19,28 @@ EXACT = 0.0 if COMM.size == 1 else 1e-10
 pytestmark = pytest.mark.three_ranks
 
 
-def slid(between, *, enforcement="penalty", recover_interior=True):
+def drag_block(between, *, enforcement="penalty", recover_interior=True):
     """Return forces, u and history of a block on a floor dragged in three increments."""
     scene = block("quadrilateral", n=4, up=-10.0)
     contact = {"displacement": np.zeros(2), "enforcement": enforcement}
     problem, contact = scene.problem(fc.Coulomb(0.3), scene.rollers(), contact=contact)
     motion = contact.parameters["displacement"]
     forces = []
-    for way in (0.0, 1e-3, 2e-3):
-        motion.value[:] = way, 0.0
+    for displacement in (0.0, 1e-3, 2e-3):
+        motion.value[:] = displacement, 0.0
         problem.solve(recover_interior=recover_interior)
         between(problem, contact)
         problem.commit()
         problem.complete()
         forces.append(contact.resultants().force)
-    return np.array(forces), nodal(scene.u), at_points(contact, contact.history.rows())
+    return np.array(forces), nodal_values(scene.u), point_values(contact, contact.history.rows())
 
 
-def nothing(problem, contact):
+def do_nothing(problem, contact):
     pass
 
 
-def changed(problem, contact):
+def change_parameters(problem, contact):
     """Change parameters of law and obstacle, which must not affect this commit."""
     kept = {name: c.value.copy() for name, c in contact.parameters.items()}
     contact.parameters["friction"].value = 0.01
@@ -51,17 +51,17 @@ def changed(problem, contact):
         contact.parameters[name].value = value
 
 
-def moved(problem, contact):
+def overwrite_displacement(problem, contact):
     """Overwrite the displacement."""
     problem.u.x.array[:] += 1.0
     contact.states.forget()
 
 
-def twice(problem, contact):
+def commit_twice(problem, contact):
     problem.commit()
 
 
-def failed(problem, contact):
+def fail_increment(problem, contact):
     """Solve an increment without a solution before the commit."""
     kept = contact.parameters["displacement"].value.copy()
     contact.parameters["displacement"].value[:] = np.nan
@@ -73,27 +73,29 @@ def failed(problem, contact):
 @pytest.mark.each
 @pytest.mark.parametrize("recover_interior", [True, False])
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
-@pytest.mark.parametrize("between", [changed, moved, twice, failed])
+@pytest.mark.parametrize(
+    "between", [change_parameters, overwrite_displacement, commit_twice, fail_increment]
+)
 def test_commit_stores_the_solution_of_solve(between, enforcement, recover_interior):
     options = {"enforcement": enforcement, "recover_interior": recover_interior}
-    expected, found = slid(nothing, **options), slid(between, **options)
+    expected, found = drag_block(do_nothing, **options), drag_block(between, **options)
     for a, b in zip(found, expected, strict=True):
-        assert close(a, b, EXACT)
+        assert is_close(a, b, EXACT)
     assert abs(expected[0][-1, 0]) > 0.1  # friction acts
 
 
 def test_second_commit_does_not_update_the_pairs():
     """With pairs updated at commits, a commit without a new solution changes nothing."""
     body = stack("quadrilateral", (3, 4), (0.5, 0.5), widths=[1.5, 1.0])
-    body.hold(FLOOR, 0, 1)
+    body.prescribe(FLOOR, 0, 1)
     slide = body.constant()
-    body.hold(ROOF, 0, value=slide)
+    body.prescribe(ROOF, 0, value=slide)
     body.F += 1e4 * body.v[1] * body.ds(ROOF)
     obstacle = fc.DeformableBody(body.tags, 10 + LOWER, update_pairs="increment")
     contact = body.contact(10 + UPPER, obstacle, fc.Coulomb(0.3))
     problem = body.problem(contact)
-    for way in (0.0, 0.1):
-        slide.value = way
+    for displacement in (0.0, 0.1):
+        slide.value = displacement
         problem.solve()
         problem.commit()
     pairings, rows = contact.pairs.n_updates, contact.history.rows()
@@ -101,10 +103,10 @@ def test_second_commit_does_not_update_the_pairs():
     slide.value = 0.2
     problem.commit()
     assert (contact.pairs.n_updates, problem.increment) == (pairings, 2)
-    assert close(contact.history.rows(), rows, 0.0)
-    assert close(contact.resultants().force, before.force, 0.0)
+    assert is_close(contact.history.rows(), rows, 0.0)
+    assert is_close(contact.resultants().force, before.force, 0.0)
     step = problem.solve()
-    assert close(step.contacts["contact"].normal_force, 1e4, 1e-8)
+    assert is_close(step.contacts["contact"].normal_force, 1e4, 1e-8)
 
 
 def test_commit_before_any_solution_changes_nothing():
@@ -113,10 +115,10 @@ def test_commit_before_any_solution_changes_nothing():
     before = contact.history.rows()
     problem.commit()
     assert problem.increment == 0
-    assert close(contact.history.rows(), before, 0.0)
+    assert is_close(contact.history.rows(), before, 0.0)
 
 
-def pressed_and_drawn(late):
+def press_and_drag(new_problem):
     """Return step and u of a block pressed by one problem, then dragged by it or by a new one."""
     scene = block("quadrilateral", n=4, up=-5.0)
     contact = scene.contact(fc.Coulomb(0.3), displacement=np.zeros(2))
@@ -130,13 +132,13 @@ def pressed_and_drawn(late):
         scene.load(up=up)
         problem.solve()
         problem.commit()
-    if late:
+    if new_problem:
         problem = made()
     scene.load(up=-8.0)
     contact.parameters["displacement"].value[:] = 1e-3, 0.0
     step = problem.solve()
     problem.commit()
-    return step, nodal(scene.u)
+    return step, nodal_values(scene.u)
 
 
 def test_new_problem_continues_a_history():
@@ -144,8 +146,8 @@ def test_new_problem_continues_a_history():
 
     This is the solver's tolerance: the initial guess differs.
     """
-    (one, u), (two, same) = pressed_and_drawn(late=False), pressed_and_drawn(late=True)
-    assert close(same, u, 1e-9)
+    (one, u), (two, same) = press_and_drag(new_problem=False), press_and_drag(new_problem=True)
+    assert is_close(same, u, 1e-9)
     scale = abs(one.energy.work)
     for name in ("work", "elastic", "springs", "dissipation", "remainder"):
         assert abs(getattr(two.energy, name) - getattr(one.energy, name)) < 1e-9 * scale, name
@@ -162,8 +164,8 @@ def test_history_continued_by_another_problem_is_refused():
     first.solve()
     first.commit()
     rows = contact.history.rows()
-    raised_everywhere(second.solve, ValueError, "another problem", "new ContactProblem")
-    assert close(contact.history.rows(), rows, 0.0)
+    assert_raised_on_all_ranks(second.solve, ValueError, "another problem", "new ContactProblem")
+    assert is_close(contact.history.rows(), rows, 0.0)
     first.solve()
     first.commit()
 
@@ -185,5 +187,5 @@ def test_results_after_a_restore_are_those_of_the_commit(enforcement):
     assert np.array_equal(contact.status, status)
     assert contact.resultants().slip == before.slip
     scene.load(up=np.nan)
-    raised_everywhere(problem.solve, ValueError, "finite")
+    assert_raised_on_all_ranks(problem.solve, ValueError, "finite")
     assert np.array_equal(contact.status, status)

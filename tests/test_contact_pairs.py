@@ -23,10 +23,10 @@ import fenics_contact as fc
 from fenics_contact import compat
 from fenics_contact.types import Array
 from scenes.blocks import dimension
-from scenes.comparing import gathered, raised_everywhere
-from scenes.elasticity import displacement_space, hold
-from scenes.meshes import mesh_of
-from scenes.tags import either, near, tagged
+from scenes.comparison import assert_raised_on_all_ranks, gather
+from scenes.elasticity import dirichlet_bc, displacement_space
+from scenes.meshes import create_mesh
+from scenes.tags import any_of, at_coordinate, tag_by_midpoints
 
 COMM = MPI.COMM_WORLD
 pytestmark = [
@@ -44,10 +44,14 @@ def box(cell: str, low: Sequence[float], high: Sequence[float], n: Sequence[int]
     d = dimension(cell)
     make = dolfinx.mesh.create_rectangle if d == 2 else dolfinx.mesh.create_box
     mesh = make(COMM, [np.array(low, float), np.array(high, float)], n, CellType[cell])
-    sides = {FLOOR: near(d - 1, low[-1]), ROOF: near(d - 1, high[-1]), WEST: near(0, low[0])}
+    sides = {
+        FLOOR: at_coordinate(d - 1, low[-1]),
+        ROOF: at_coordinate(d - 1, high[-1]),
+        WEST: at_coordinate(0, low[0]),
+    }
     if d == 3:
-        sides[SOUTH] = near(1, low[1])
-    return mesh, None, tagged(mesh, sides)
+        sides[SOUTH] = at_coordinate(1, low[1])
+    return mesh, None, tag_by_midpoints(mesh, sides)
 
 
 def disc(centre: Sequence[float], radius: float, n: int) -> tuple:
@@ -58,7 +62,7 @@ def disc(centre: Sequence[float], radius: float, n: int) -> tuple:
         places.append(radius * ring / n * np.column_stack([np.cos(angle), np.sin(angle)]))
     x = np.concatenate(places)
     cells = scipy.spatial.Delaunay(x).simplices
-    return mesh_of("triangle", x + np.asarray(centre, float), cells), None, None
+    return create_mesh("triangle", x + np.asarray(centre, float), cells), None, None
 
 
 class Pressed:
@@ -96,7 +100,7 @@ class Pressed:
 
     def hold(self, body: str, tag: int, component: int) -> fem.DirichletBC:
         """Return a condition that fixes one displacement component of a side."""
-        return hold(self.u, self.joined.facets, self.joined.facet(body, tag), component)
+        return dirichlet_bc(self.u, self.joined.facets, self.joined.facet(body, tag), component)
 
     def solve(self, contacts: list[fc.Contact], **options: Any) -> fc.Step:
         """Solve and commit one increment with these contacts."""
@@ -110,7 +114,7 @@ class Pressed:
         facets = self.joined.facets.find(self.joined.facet(body, ROOF))
         space = self.u.function_space.sub(self.d - 1)
         dofs = fem.locate_dofs_topological(space, self.d - 1, facets)
-        return gathered(COMM, -self.u.x.array[dofs])
+        return gather(COMM, -self.u.x.array[dofs])
 
 
 def three_blocks(cell: str) -> Pressed:
@@ -149,7 +153,7 @@ def test_stack_has_uniform_stress_and_the_load_in_every_joint(cell: str) -> None
     bound = 0.0
     for contact in contacts:
         assert abs(up(contact)) == pytest.approx(2.0, rel=1e-10)
-        pressure = gathered(COMM, contact.pressure)
+        pressure = gather(COMM, contact.pressure)
         assert pressure == pytest.approx(np.full(pressure.shape, 2.0), rel=1e-9)
         bound += contact.resultants().max_penetration
     expected = 2.0 * 0.5 * (1 / 1e3 + 1 / 2e3 + 1 / 5e2) + bound
@@ -211,7 +215,7 @@ def test_two_blocks_on_one_base(fine: str) -> None:
 def rubber_between_plates(by_hand: bool) -> list[fc.Contact]:
     """Return the solved contacts of a rubber disc, compressed by a tenth between two plates."""
     mesh, _, _ = disc((0, 0), 0.5, 6)
-    around = tagged(mesh, {ROOF: lambda x, cell: np.ones(len(x), dtype=bool)})
+    around = tag_by_midpoints(mesh, {ROOF: lambda x, cell: np.ones(len(x), dtype=bool)})
     parts = {
         "below": box("triangle", (-1, -0.7), (1, -0.5), (10, 1)),
         "disc": (mesh, None, around),
@@ -223,8 +227,10 @@ def rubber_between_plates(by_hand: bool) -> list[fc.Contact]:
     E = joined.by_body({"below": 50.0, "disc": 1.0, "above": 50.0})
     body = fc.elasticity.NeoHookean(u, E, 0.3, "plane strain")
     down = fem.Constant(joined.mesh, -0.1)
-    bcs = [hold(u, tags, joined.facet("below", FLOOR), i) for i in (0, 1)]
-    bcs += [hold(u, tags, joined.facet("above", ROOF), i, c) for i, c in ((0, 0.0), (1, down))]
+    bcs = [dirichlet_bc(u, tags, joined.facet("below", FLOOR), i) for i in (0, 1)]
+    bcs += [
+        dirichlet_bc(u, tags, joined.facet("above", ROOF), i, c) for i, c in ((0, 0.0), (1, down))
+    ]
     sideways, _ = space.sub(0).collapse()
     middle = fem.locate_dofs_geometrical(
         (space.sub(0), sideways), lambda x: (np.abs(x[0]) < 1e-9) & (np.abs(x[1]) < 0.49)
@@ -283,14 +289,14 @@ def fork(seed: int | None = None) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshT
     if seed is not None:
         cells = np.random.default_rng(seed).permutation(cells)
     used, number = np.unique(cells, return_inverse=True)
-    mesh = mesh_of("quadrilateral", x[used], number.reshape(cells.shape))
+    mesh = create_mesh("quadrilateral", x[used], number.reshape(cells.shape))
     sides = {
-        FLOOR: near(1, 0.0),
-        WEST: near(0, 0.45),
-        SOUTH: near(0, 0.55),
-        ROOF: either(near(0, 0.0), near(0, 1.0)),
+        FLOOR: at_coordinate(1, 0.0),
+        WEST: at_coordinate(0, 0.45),
+        SOUTH: at_coordinate(0, 0.55),
+        ROOF: any_of(at_coordinate(0, 0.0), at_coordinate(0, 1.0)),
     }
-    return mesh, tagged(mesh, sides)
+    return mesh, tag_by_midpoints(mesh, sides)
 
 
 def test_self_contact_equals_contact_of_tagged_sides() -> None:
@@ -304,7 +310,7 @@ def test_self_contact_equals_contact_of_tagged_sides() -> None:
         ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
         F = fc.elasticity.NeoHookean(u, 50.0, 0.3, "plane strain").residual(v)
         F += squeeze * ufl.dot(ufl.FacetNormal(mesh), v) * ds(ROOF)
-        bcs = [hold(u, tags, FLOOR, i) for i in (0, 1)]
+        bcs = [dirichlet_bc(u, tags, FLOOR, i) for i in (0, 1)]
         if by_hand:
             surface, other = fc.ContactSurface(mesh, tags, WEST), fc.DeformableBody(tags, SOUTH)
             contacts = [fc.Contact(u, surface, other, fc.Frictionless(), kinematics="finite")]
@@ -331,7 +337,7 @@ def test_slave_side_of_self_contact_is_independent_of_cell_numbering() -> None:
         mesh, _ = fork(seed)
         u = fem.Function(displacement_space(mesh, 1))
         (contact,) = fc.find_contact_pairs(u, fc.Frictionless(), 0.12, self_contact=True)
-        assert np.allclose(gathered(mesh.comm, contact.points)[:, 0], 0.45)
+        assert np.allclose(gather(mesh.comm, contact.points)[:, 0], 0.45)
 
 
 def test_all_facets_of_a_hole_are_slave_and_master(caplog: pytest.LogCaptureFixture) -> None:
@@ -339,7 +345,9 @@ def test_all_facets_of_a_hole_are_slave_and_master(caplog: pytest.LogCaptureFixt
     angle = 2 * np.pi * np.arange(16) / 16
     rings = [r * np.column_stack([np.cos(angle), np.sin(angle)]) for r in (1.0, 1.5)]
     i, j = np.arange(16), (np.arange(16) + 1) % 16
-    mesh = mesh_of("quadrilateral", np.concatenate(rings), np.column_stack([i, j, i + 16, j + 16]))
+    mesh = create_mesh(
+        "quadrilateral", np.concatenate(rings), np.column_stack([i, j, i + 16, j + 16])
+    )
     u = fem.Function(displacement_space(mesh, 1))
     with caplog.at_level(logging.INFO, "fenics_contact"):
         assert fc.find_contact_pairs(u, fc.Frictionless(), 1.2, self_contact=True) == []
@@ -347,7 +355,7 @@ def test_all_facets_of_a_hole_are_slave_and_master(caplog: pytest.LogCaptureFixt
             u, fc.Frictionless(), 2.0, self_contact=True, kinematics="finite"
         )
     assert facets_of(contact) == 16
-    points = gathered(COMM, contact.gap)
+    points = gather(COMM, contact.gap)
     # The gap across the hole at the middle of facets is the diameter of the inscribed circle.
     assert points.min() == pytest.approx(2 * np.cos(np.pi / 16))
     if COMM.rank == 0:
@@ -373,7 +381,7 @@ def test_bodies_far_apart_are_not_paired(caplog: pytest.LogCaptureFixture) -> No
     if COMM.rank == 0:
         # Γc is on the finer disc; its vertex is at distance 1 from the vertex of the other.
         assert "1-2: Γc on 2 with" in caplog.text and "; 1 to 1." in caplog.text
-    x = gathered(COMM, contact.points)
+    x = gather(COMM, contact.points)
     assert np.all(x[:, 0] > 1.9) and facets_of(contact) > 3
 
 
@@ -387,7 +395,7 @@ def test_back_sides_are_not_paired() -> None:
     # The outer plates also face each other across the middle one; this contact stays open.
     assert names == ["0-1", "0-2", "1-2"]
     for contact, y in zip(contacts, (0.1, 0.2, 0.2), strict=True):
-        x = gathered(COMM, contact.points)
+        x = gather(COMM, contact.points)
         assert x[:, 1] == pytest.approx(np.full(len(x), y))
     close = fc.find_contact_pairs(u, fc.Frictionless(), 0.09, bodies=joined)
     assert [contact.name for contact in close] == ["0-1", "1-2"]
@@ -405,7 +413,7 @@ def test_initial_overlap_is_found_up_to_half_a_cell() -> None:
         contacts = fc.find_contact_pairs(u, fc.Frictionless(), 0.3, bodies=joined)
         assert len(contacts) == n_contacts
         for contact in contacts:
-            gap = gathered(COMM, contact.gap)
+            gap = gather(COMM, contact.gap)
             assert facets_of(contact) == 5 and gap == pytest.approx(np.full(len(gap), -depth))
 
 
@@ -497,4 +505,6 @@ def test_invalid_arguments_are_reported_on_every_rank() -> None:
         ({"update_pairs": "often"}, ["'often'"]),
     ):
         arguments = ready | given
-        raised_everywhere(lambda a=arguments: fc.find_contact_pairs(**a), ValueError, *words)
+        assert_raised_on_all_ranks(
+            lambda a=arguments: fc.find_contact_pairs(**a), ValueError, *words
+        )

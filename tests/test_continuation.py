@@ -7,9 +7,9 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from scenes.block_on_ball import BlockOnBall, loaded_block
 from scenes.blocks import TOP, block
-from scenes.comparing import close, nodal
-from scenes.rubbing import Rub, pressed
+from scenes.comparison import is_close, nodal_values
 
 pytestmark = pytest.mark.two_ranks
 
@@ -25,12 +25,12 @@ def test_continuation_agrees_with_newton(cell, degree):
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
     states = []
     for method in ("continuation", "newton"):
-        scene, problem, contact = pressed(cell, law, method, degree=degree, n=3, side=0.06)
+        scene, problem, contact = loaded_block(cell, law, method, degree=degree, n=3, side=0.06)
         step = problem.solve()
         assert [attempt.method for attempt in step.attempts] == [method]
         assert contact.inputs.stiffness_factor.value == 1.0
-        states.append(nodal(scene.u))
-    assert close(*states, 1e-6)
+        states.append(nodal_values(scene.u))
+    assert is_close(*states, 1e-6)
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
@@ -39,12 +39,12 @@ def test_start_at_a_solution_takes_no_iterations(cell):
 
     Softened contact would move away from it, and not back if an obstacle had carried a body.
     """
-    scene, problem, _ = pressed(cell, fc.Coulomb(0.3, k_n=2e4, k_t=1e4), "continuation", n=3)
+    scene, problem, _ = loaded_block(cell, fc.Coulomb(0.3, k_n=2e4, k_t=1e4), "continuation", n=3)
     problem.solve()
     problem.commit()
-    before = nodal(scene.u)
+    before = nodal_values(scene.u)
     assert problem.solve().iterations == 0
-    assert close(nodal(scene.u), before, 1e-9)
+    assert is_close(nodal_values(scene.u), before, 1e-9)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -58,10 +58,10 @@ def test_stiff_contact_from_a_cold_start(method, factor, friction):
     forces = []
     for scaled in (fc.RelativeStiffness(1e3), fc.RelativeStiffness(factor)):
         law = fc.Coulomb(friction, scaled, scaled) if friction else fc.Frictionless(scaled)
-        _, problem, _ = pressed("quadrilateral", law, method, n=8)
+        _, problem, _ = loaded_block("quadrilateral", law, method, n=8)
         step = problem.solve()
         forces.append(step.contacts["contact"].normal_force)
-    assert close(forces[1], forces[0], 2e-2 if friction else 1e-3)
+    assert is_close(forces[1], forces[0], 2e-2 if friction else 1e-3)
     assert step.contacts["contact"].max_penetration < 1e-1 / factor
     # Full Newton steps solve the frictionless problem, which is piecewise linear.
     fallbacks = [] if method == "newton" else ["continuation"]
@@ -80,7 +80,7 @@ def test_failure_without_fallback_names_chattering_points(caplog):
     stiff = fc.RelativeStiffness(1e4)
     law = fc.Coulomb(0.3, stiff, stiff)
     options = {"snes_linesearch_type": "basic"}
-    _, problem, contact = pressed(
+    _, problem, contact = loaded_block(
         "quadrilateral", law, "newton", n=8, fallback=False, petsc_options=options
     )
     with caplog.at_level(logging.INFO, "fenics_contact"), pytest.raises(fc.NotConverged) as caught:
@@ -99,7 +99,7 @@ def test_every_failure_is_logged(caplog):
     """Every failed method is in the log and, in order, in the attempts of the step."""
     stiff = fc.RelativeStiffness(1e6)
     law = fc.Coulomb(0.3, stiff, stiff)
-    _, problem, _ = pressed("quadrilateral", law, "newton", n=8)
+    _, problem, _ = loaded_block("quadrilateral", law, "newton", n=8)
     with caplog.at_level(logging.INFO, "fenics_contact"):
         step = problem.solve()
     texts = [record.getMessage() for record in caplog.records]
@@ -120,18 +120,18 @@ def test_continuation_does_not_affect_the_history():
     ends = []
     for method in ("continuation", "lbfgs"):
         law = fc.Coulomb(0.3, fc.RelativeStiffness(100), fc.RelativeStiffness(100))
-        made = Rub(law, mesh={"n": 8}, reach=0.05, method=method)
+        made = BlockOnBall(law, mesh={"n": 8}, amplitude=0.05, method=method)
         steps = list(fc.increments(made.problem, made.load, 0.0, 4.0, steps=8))
         assert all(step.energy.dissipation >= 0 for step in steps)
-        ends.append(nodal(made.scene.u))
-    assert close(*ends, 1e-5)
+        ends.append(nodal_values(made.scene.u))
+    assert is_close(*ends, 1e-5)
 
 
 def test_cut_increments_list_all_attempts():
     """The attempts are all failures, all cuts and the success, in order."""
     scene = block("triangle", up=0.0)
     push = fem.Constant(scene.mesh, 0.0)
-    bcs = [*scene.rollers(), scene.hold(TOP, 1, push)]
+    bcs = [*scene.rollers(), scene.dirichlet_bc(TOP, 1, push)]
     problem, _ = scene.problem(fc.Frictionless(k_n=1e4), bcs, method="lbfgs", fallback=False)
     solve, fail = problem.solve, [True, True, False]
 
@@ -163,10 +163,10 @@ def test_finite_kinematics_with_friction_start_with_newton():
     forces, attempts = [], ()
     for kinematics in ("small", "finite"):
         scene = block("triangle", 1, n=6, E=100.0)
-        bcs = [scene.hold(TOP, i, value) for i, value in enumerate((0.005, -0.01))]
+        bcs = [scene.dirichlet_bc(TOP, i, value) for i, value in enumerate((0.005, -0.01))]
         law, given = fc.Coulomb(0.3, k_n=1e3, k_t=1e3), {"kinematics": kinematics}
         step = scene.problem(law, bcs, contact=given)[0].solve()
         forces.append(step.contacts["contact"].force)
         attempts = step.attempts
     assert [a.method for a in attempts] == ["newton"]
-    assert close(forces[1], forces[0], 1e-7)
+    assert is_close(forces[1], forces[0], 1e-7)

@@ -11,8 +11,14 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.contact.obstacle_sampler import ObstacleSampler
 from scenes.blocks import TOP, block
-from scenes.comparing import close, gathered, raised_everywhere, shared_folder, sorted_by_place
-from scenes.rubber import TIGHT, disc, domed, rubber
+from scenes.comparison import (
+    assert_raised_on_all_ranks,
+    gather,
+    is_close,
+    shared_folder,
+    sort_by_coordinates,
+)
+from scenes.rubber import TIGHT_TOLERANCE, bend_top, disc, rubber
 from scenes.surfaces import ball, circle, ring
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
@@ -29,7 +35,7 @@ def pressed(cell, obstacle, *, law=None, unit=1.0, degree=1, cross_check=False, 
     shift, angle = fem.Constant(scene.mesh, np.zeros(d)), fem.Constant(scene.mesh, 0.0)
     tool = obstacle(shift, angle)
     law = law or fc.Coulomb(0.3, 1e4 / unit, 1e4 / unit)
-    options = {"petsc_options": TIGHT, "cross_check": cross_check}
+    options = {"petsc_options": TIGHT_TOLERANCE, "cross_check": cross_check}
     problem, made = scene.problem(tool, law, contact=contact, **options)
     forces = []
     for side, up, turn in HISTORY:
@@ -85,7 +91,7 @@ def test_spline_agrees_with_the_cylinder(cell, enforcement):
     options = {"enforcement": enforcement, "tolerance": 1e-8}
     one, other = (pressed(cell, tool(d, s), **options) for s in ("cylinder", "spline"))
     assert np.abs(one[-1]).min() >= 0 and abs(one[1, 0]) > 1.0
-    assert close(other, one, 1e-6)
+    assert is_close(other, one, 1e-6)
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
@@ -115,7 +121,7 @@ def test_forces_are_independent_of_the_unit_of_length(shape):
     """
     one = pressed("triangle", tool(2, shape), cross_check=True)
     for unit in (1e-6, 1e6):
-        assert close(pressed("triangle", tool(2, shape, unit), unit=unit), one, 1e-7)
+        assert is_close(pressed("triangle", tool(2, shape, unit), unit=unit), one, 1e-7)
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
@@ -135,7 +141,7 @@ def test_spline_driven_by_a_force_agrees_with_the_cylinder(kinematics):
             obstacle,
             fc.Coulomb(0.3, 1e4, 1e4),
             contact={"kinematics": kinematics},
-            petsc_options=TIGHT,
+            petsc_options=TIGHT_TOLERANCE,
             small_displacement_tolerance=np.inf,
         )
         for side.value, down.value in ((0.0, -5.0), (0.0, -20.0), (0.02, -30.0)):
@@ -143,7 +149,7 @@ def test_spline_driven_by_a_force_agrees_with_the_cylinder(kinematics):
             problem.commit()
             went.append(float(contact.free_motion[1].value))
         assert contact.resultants().force[1] == pytest.approx(down.value, rel=1e-8)
-    assert close(np.array(went[3:]), np.array(went[:3]), 1e-6)
+    assert is_close(np.array(went[3:]), np.array(went[:3]), 1e-6)
     assert went[2] < went[0] < 0
 
 
@@ -172,7 +178,7 @@ def test_user_defined_sampled_ball_agrees_with_ball():
     def bubble(shift, angle):
         return Bubble((0.0, 1.8), 0.8, shift, fc.Rotation(angle, (0.0, 1.8)))
 
-    assert close(pressed("triangle", bubble), pressed("triangle", tool(2, "ball")), 1e-9)
+    assert is_close(pressed("triangle", bubble), pressed("triangle", tool(2, "ball")), 1e-9)
 
 
 class NoDistance(Bubble):
@@ -199,7 +205,7 @@ def test_samples_that_are_no_distance_are_refused(scale, tilt, kinematics):
     scene = block("triangle", 1, n=6)
     up = fem.Constant(scene.mesh, np.zeros(2))
     given = {"obstacle": NoDistance(scale, tilt, up), "kinematics": kinematics}
-    bcs = [scene.hold(TOP, 0), scene.hold(TOP, 1)]
+    bcs = [scene.dirichlet_bc(TOP, 0), scene.dirichlet_bc(TOP, 1)]
     problem, _ = scene.problem(
         fc.Frictionless(1e3), bcs, contact=given, small_displacement_tolerance=np.inf
     )
@@ -208,7 +214,7 @@ def test_samples_that_are_no_distance_are_refused(scale, tilt, kinematics):
         problem.solve()
     else:
         words = "the gradient of the gap of the NoDistance differs by", "it must be a distance"
-        raised_everywhere(problem.solve, fc.NotConverged, *words)
+        assert_raised_on_all_ranks(problem.solve, fc.NotConverged, *words)
 
 
 @pytest.mark.parametrize("spread", [1e-2, 1e-6])
@@ -272,13 +278,13 @@ def test_error_of_a_sample_during_the_iteration_is_raised(fault, error, text):
     """A NaN does not count as an open gap, and the error of one rank is raised on all ranks."""
     scene = block("triangle", 1, n=4)
     down = fem.Constant(scene.mesh, 0.0)
-    bcs = [scene.hold(TOP, 0), scene.hold(TOP, 1, down)]
+    bcs = [scene.dirichlet_bc(TOP, 0), scene.dirichlet_bc(TOP, 1, down)]
     given = {"obstacle": Faulty(fault), "kinematics": "finite"}
     problem, contact = scene.problem(fc.Coulomb(0.3), bcs, contact=given)
     problem.solve()
     problem.commit()
     down.value = -0.01
-    raised_everywhere(problem.solve, error, text)
+    assert_raised_on_all_ranks(problem.solve, error, text)
     down.value = 0.01
     problem.solve()
     assert np.all(contact.pressure == 0.0)
@@ -292,7 +298,7 @@ def test_missing_members_of_a_sampled_obstacle_are_named(missing):
     obstacle = type("Floor", (fc.SampledObstacle,), said)()
     scene = block("triangle", 1)
     words = "Floor is no obstacle", f"must define {missing}"
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: scene.contact(fc.Frictionless(), obstacle=obstacle, kinematics="finite"),
         ValueError,
         *words,
@@ -303,7 +309,7 @@ def test_obstacle_without_place_is_refused():
     """A subclass of `Obstacle` without ``place`` is refused by name."""
     obstacle = type("Nowhere", (fc.Obstacle,), {})()
     scene = block("triangle", 1)
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: scene.contact(fc.Frictionless(), obstacle=obstacle),
         ValueError,
         "Nowhere is no obstacle",
@@ -316,7 +322,9 @@ def test_sample_of_wrong_shape_is_refused():
     given = {"obstacle": Faulty("shape"), "kinematics": "finite"}
     scene = block("triangle", 1)
     words = "Faulty: distance of its sample has shape", "must be"
-    raised_everywhere(scene.contact(fc.Frictionless(), **given).evaluate, ValueError, *words)
+    assert_raised_on_all_ranks(
+        scene.contact(fc.Frictionless(), **given).evaluate, ValueError, *words
+    )
 
 
 def test_checkpoint_of_another_profile_is_refused(tmp_path):
@@ -333,7 +341,9 @@ def test_checkpoint_of_another_profile_is_refused(tmp_path):
     problem.commit()
     fc.checkpoint.save(problem, path)
     fc.checkpoint.load(made(60), path)
-    raised_everywhere(lambda: fc.checkpoint.load(made(61), path), ValueError, "RigidProfile")
+    assert_raised_on_all_ranks(
+        lambda: fc.checkpoint.load(made(61), path), ValueError, "RigidProfile"
+    )
 
 
 @pytest.mark.each
@@ -366,11 +376,11 @@ def test_tractions_rotate_with_the_whole_scene(cell, shape):
             angle.value = a
             contact.evaluate()
             if number == 2:
-                rows = gathered(COMM, contact.points), gathered(COMM, contact.traction @ turn)
-                found.append(sorted_by_place(*rows)[:, d:])
+                rows = gather(COMM, contact.points), gather(COMM, contact.traction @ turn)
+                found.append(sort_by_coordinates(*rows)[:, d:])
             contact.commit()
     assert np.abs(found[0]).max() > 10.0
-    assert close(found[1], found[0], 1e-9)
+    assert is_close(found[1], found[0], 1e-9)
 
 
 @pytest.mark.parametrize("law", [fc.Frictionless(1e4), fc.Coulomb(0.2, 1e4, 1e4)])
@@ -387,7 +397,7 @@ def test_small_and_finite_kinematics_agree_at_small_displacements(law):
     for size in (4e-3, 1e-3):
         found = []
         for kinematics, profile in (("finite", True), ("small", True), ("small", False)):
-            scene = rubber("triangle", n=(12, 6), linear=True, bend=domed)
+            scene = rubber("triangle", n=(12, 6), linear=True, bend=bend_top)
             shift = fem.Constant(scene.mesh, np.zeros(2))
             cavity = fc.Ball((0, -1), 2.0, inside=True, displacement=shift)
             spline = fc.RigidProfile(arc, displacement=shift)
@@ -395,7 +405,7 @@ def test_small_and_finite_kinematics_agree_at_small_displacements(law):
                 spline if profile else cavity,
                 law,
                 contact={"kinematics": kinematics},
-                petsc_options=TIGHT,
+                petsc_options=TIGHT_TOLERANCE,
                 small_displacement_tolerance=np.inf,
             )
             for side, up in ((0.0, -1.0), (0.5, -1.5)):
@@ -405,7 +415,7 @@ def test_small_and_finite_kinematics_agree_at_small_displacements(law):
             found.append(contact.resultants().force)
             told.append(step.verdict.small_displacement_error["contact"].worst)
         share.append(np.linalg.norm(found[0] - found[1]) / np.linalg.norm(found[1]))
-        assert close(found[1], found[2], 1e-5)
+        assert is_close(found[1], found[2], 1e-5)
         assert told[-3] == 0.0 and told[-2] == pytest.approx(told[-1], rel=1e-2)
     assert share[0] > 1e-5
     assert share[0] / share[1] == pytest.approx(4.0, rel=0.25)

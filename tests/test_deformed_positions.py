@@ -16,9 +16,9 @@ from scenes.blocks import BOTTOM as BLOCK_BOTTOM
 from scenes.blocks import TOP as BLOCK_TOP
 from scenes.blocks import block_mesh, dimension
 from scenes.bodies import Bodies, boxes
-from scenes.comparing import raised_everywhere
-from scenes.elasticity import displacement_space, hold
-from scenes.tags import between, either, near
+from scenes.comparison import assert_raised_on_all_ranks
+from scenes.elasticity import dirichlet_bc, displacement_space
+from scenes.tags import any_of, at_coordinate, at_interface
 
 pytestmark = pytest.mark.two_ranks
 E = 1000.0
@@ -29,13 +29,13 @@ KINEMATICS = pytest.mark.parametrize("kinematics", ["small", "finite"])
 def block(low=0.0, bend=None, length=1.0, n=(8, 4)):
     """Return a block over [0, length] with its underside at a height."""
     axes = [[np.linspace(0.0, length, n[0] + 1), low + np.linspace(0.0, 0.5, n[1] + 1)]]
-    sides = {BOTTOM: near(1, low), TOP: near(1, low + 0.5)}
+    sides = {BOTTOM: at_coordinate(1, low), TOP: at_coordinate(1, low + 0.5)}
     return Bodies(boxes(axes, sides, bend=bend), E, 0.3)
 
 
 def fails(problem, *words):
     """Assert that the next increment fails on all ranks with these words."""
-    raised_everywhere(problem.solve, fc.NotConverged, *words)
+    assert_raised_on_all_ranks(problem.solve, fc.NotConverged, *words)
 
 
 def plate(half):
@@ -49,16 +49,18 @@ def test_obstacle_inside_of_a_body_is_refused(body_of_ball, kinematics):
     """A ball inside of one of two blocks is refused; between the blocks it is accepted."""
     lines = np.linspace(0.0, 1.0, 5)
     axes = [[lines, lines], [2.0 + lines, lines]]
-    around = either(*(near(0, x) for x in (0.0, 1.0, 2.0, 3.0)), near(1, 0.0))
-    body = Bodies(boxes(axes, {SIDES: around, TOP: near(1, 1.0)}), E, 0.3)
-    body.hold(TOP, 0, 1)
+    around = any_of(*(at_coordinate(0, x) for x in (0.0, 1.0, 2.0, 3.0)), at_coordinate(1, 0.0))
+    body = Bodies(boxes(axes, {SIDES: around, TOP: at_coordinate(1, 1.0)}), E, 0.3)
+    body.prescribe(TOP, 0, 1)
 
     def problem(x):
         ball = fc.Ball((x, 0.5), 0.2)
         return body.problem(body.contact(SIDES, ball, fc.Frictionless(), kinematics=kinematics))
 
     x = 0.5 + 2 * body_of_ball
-    raised_everywhere(lambda: problem(x), ValueError, "the obstacle is inside of the undeformed")
+    assert_raised_on_all_ranks(
+        lambda: problem(x), ValueError, "the obstacle is inside of the undeformed"
+    )
     assert problem(1.5).solve().verdict.failures == []
 
 
@@ -68,8 +70,8 @@ def test_tunnelling_through_a_thin_plate_is_refused(half, steps):
     """A block moves by 1.5 through a plate in one or two increments; no point ends inside."""
     body = block(low=0.5)
     down = body.constant()
-    body.hold(TOP, 0)
-    body.hold(TOP, 1, value=down)
+    body.prescribe(TOP, 0)
+    body.prescribe(TOP, 1, value=down)
     contact = body.contact(BOTTOM, plate(half), fc.Frictionless(), kinematics="finite")
     problem = body.problem(contact)
     down.value = -1.5 / steps
@@ -82,7 +84,7 @@ def test_soft_contact_does_not_tunnel_in_small_increments():
     """With soft springs a point in contact would reach the other side of the plate."""
     body = block()
     up = body.constant(np.zeros(2))
-    body.hold(TOP, 0, 1)
+    body.prescribe(TOP, 0, 1)
     obstacle = fc.SignedDistance(lambda x: abs(x[1] + 0.01) - 0.01, displacement=up)
     contact = body.contact(BOTTOM, obstacle, fc.Frictionless(k_n=E), kinematics="finite")
     problem = body.problem(contact)
@@ -105,7 +107,7 @@ def test_plate_thinner_than_the_resolution_does_not_change_sides(law):
     """
     body = block(n=(1, 1))
     up = body.constant(np.zeros(2))
-    body.hold(TOP, 0, 1)
+    body.prescribe(TOP, 0, 1)
     obstacle = fc.SignedDistance(lambda x: abs(x[1] + 0.0105) - 0.01, displacement=up)
     contact = body.contact(BOTTOM, obstacle, law, kinematics="finite")
     problem = body.problem(contact)
@@ -127,7 +129,7 @@ def test_tunnelling_is_refused_again_after_a_refused_increment(kinematics):
     """A path starts from the committed state, not from a refused trial state."""
     body = block()
     up = body.constant(np.zeros(2))
-    body.hold(TOP, 0, 1)
+    body.prescribe(TOP, 0, 1)
     obstacle = fc.SignedDistance(lambda x: abs(x[1] + 0.05) - 0.01, displacement=up)
     contact = body.contact(BOTTOM, obstacle, fc.Frictionless(), kinematics=kinematics)
     problem = body.problem(contact)
@@ -148,12 +150,14 @@ def test_tunnelling_is_refused_without_recovered_interior_displacement(kinematic
     """
     body = block()
     up = body.constant(np.zeros(2))
-    body.hold(TOP, 0, 1)
+    body.prescribe(TOP, 0, 1)
     ball = fc.Ball((0.5, -0.65), 0.2, displacement=up)
     contact = body.contact(BOTTOM, ball, fc.Frictionless(), kinematics=kinematics)
     problem = body.problem(contact, condensation=True)
     up.value[1] = 0.9
-    raised_everywhere(lambda: problem.solve(recover_interior=False), fc.NotConverged, "has crossed")
+    assert_raised_on_all_ranks(
+        lambda: problem.solve(recover_interior=False), fc.NotConverged, "has crossed"
+    )
     up.value[1] = 0.44
     assert not problem.solve(recover_interior=False).complete
     assert contact.resultants().normal_force == 0.0
@@ -164,8 +168,8 @@ def ball_below(moved_by, kinematics, radius=0.2, gap=0.03):
     body = block(n=(4, 2))
     shift, center = body.constant(np.zeros(2)), body.constant((0.3, -gap - radius))
     lead = body.constant()
-    body.hold(TOP, 0)
-    body.hold(TOP, 1, value=lead)
+    body.prescribe(TOP, 0)
+    body.prescribe(TOP, 1, value=lead)
     if moved_by == "distance":
         ball = fc.SignedDistance(lambda x: ufl.sqrt(ufl.dot(x - center, x - center)) - radius)
     else:
@@ -185,8 +189,8 @@ def test_tunnelling_of_an_obstacle_moved_by_a_constant_is_refused(radius, moved_
     """
     problem, _, _, place = ball_below(moved_by, kinematics, radius)
     start = place.copy()
-    for way in (0.47, 0.47, 1.2):
-        place[:] = start[0], start[1] + way
+    for displacement in (0.47, 0.47, 1.2):
+        place[:] = start[0], start[1] + displacement
         fails(problem, "has crossed")
     place[:] = start[0] + 0.3, start[1] + 0.02  # still below the block
     assert problem.solve().verdict.failures == []
@@ -198,9 +202,9 @@ def test_center_and_displacement_of_a_ball_give_the_same_force():
     for moved_by in ("displacement", "center"):
         problem, contact, lead, place = ball_below(moved_by, "finite", gap=0.0)
         found = []
-        for way in ((0.0, 0.01), (0.4, 0.0), (0.0, -0.5)):
-            place[:] += way
-            lead.value = min(way[1], 0.0)
+        for displacement in ((0.0, 0.01), (0.4, 0.0), (0.0, -0.5)):
+            place[:] += displacement
+            lead.value = min(displacement[1], 0.0)
             problem.solve()
             problem.commit()
             found.append(contact.resultants().normal_force)
@@ -213,7 +217,7 @@ def refuse_pin(center, radius, ups, kinematics):
     """Assert that one of these upward displacements of a pin into a block is refused."""
     body = block(n=(4, 2))
     up = body.constant(np.zeros(2))
-    body.hold(TOP, 0, 1)
+    body.prescribe(TOP, 0, 1)
     pin = fc.Ball(center, radius, displacement=up)
     contact = body.contact(BOTTOM, pin, fc.Frictionless(), kinematics=kinematics)
     problem = body.problem(contact)
@@ -252,7 +256,7 @@ def test_blade_does_not_penetrate_a_facet(steps, at, kinematics):
     """
     body = block(n=(4, 2))
     up = body.constant(np.zeros(2))
-    body.hold(TOP, 0, 1)
+    body.prescribe(TOP, 0, 1)
 
     def blade(x):
         along = ufl.max_value(-0.65, ufl.min_value(-0.05, x[1]))
@@ -281,7 +285,7 @@ def test_pin_that_also_moves_sideways_is_detected(kinematics, at, aside):
     """
     body = block(n=(2, 1))
     move = body.constant(np.zeros(2))
-    body.hold(TOP, 0, 1)
+    body.prescribe(TOP, 0, 1)
     contact = body.contact(
         BOTTOM,
         fc.Ball((at, -0.04), 0.04, displacement=move),
@@ -316,7 +320,7 @@ def test_sliding_past_a_thin_tip_is_not_tunnelling(half):
     for steps in (1, 3):
         body = block(n=(8, 2))
         move = body.constant(np.zeros(2))
-        body.hold(TOP, 0, 1)
+        body.prescribe(TOP, 0, 1)
         obstacle = fc.SignedDistance(capsule((0.25, -0.01), half, 0.01), displacement=move)
         contact = body.contact(BOTTOM, obstacle, fc.Frictionless(), kinematics="finite")
         problem = body.problem(contact)
@@ -337,11 +341,15 @@ def test_blade_does_not_pass_sideways_through_a_body(kinematics, sides):
 
     The flanks, through which it enters and leaves, need not belong to Γc.
     """
-    flanks = {SIDES: lambda x, cell: near(0, 0.0)(x, cell) | near(0, 1.0)(x, cell)}
+    flanks = {
+        SIDES: lambda x, cell: at_coordinate(0, 0.0)(x, cell) | at_coordinate(0, 1.0)(x, cell)
+    }
     axes = [[np.linspace(0.0, 1.0, 9), np.linspace(0.0, 0.5, 5)]]
-    body = Bodies(boxes(axes, {BOTTOM: near(1, 0.0), TOP: near(1, 0.5), **flanks}), E, 0.3)
+    body = Bodies(
+        boxes(axes, {BOTTOM: at_coordinate(1, 0.0), TOP: at_coordinate(1, 0.5), **flanks}), E, 0.3
+    )
     move = body.constant(np.zeros(2))
-    body.hold(TOP, 0, 1)
+    body.prescribe(TOP, 0, 1)
 
     def blade(x):
         along = ufl.max_value(-0.65, ufl.min_value(0.2, x[1]))
@@ -363,9 +371,14 @@ def test_bending_of_a_facet_is_not_tunnelling():
     forces = []
     for steps in (1, 5):
         axes = [[np.linspace(0.0, 1.0, 3), np.linspace(0.0, 0.5, 3)]]
-        body = Bodies(boxes(axes, {BOTTOM: near(1, 0.0), TOP: near(1, 0.5)}), E, 0.3, degree=2)
+        body = Bodies(
+            boxes(axes, {BOTTOM: at_coordinate(1, 0.0), TOP: at_coordinate(1, 0.5)}),
+            E,
+            0.3,
+            degree=2,
+        )
         move = body.constant(np.zeros(2))
-        body.hold(TOP, 0, 1)
+        body.prescribe(TOP, 0, 1)
         ball = fc.Ball((0.25, -0.3), 0.3, displacement=move)
         contact = body.contact(BOTTOM, ball, fc.Frictionless(), kinematics="finite")
         problem = body.problem(contact)
@@ -389,7 +402,7 @@ def test_rotation_of_a_blade_through_a_body_is_refused(steps):
         return ufl.sqrt(ufl.dot(off, off)) - 0.01
 
     body = block()
-    body.hold(TOP, 0, 1)
+    body.prescribe(TOP, 0, 1)
     angle = body.constant()
     obstacle = fc.SignedDistance(blade, rotation=fc.Rotation(angle, (-1.0, -0.3)))
     problem = body.problem(body.contact(BOTTOM, obstacle, fc.Frictionless(), kinematics="finite"))
@@ -408,7 +421,7 @@ def test_full_turn_of_a_blade_through_a_body_is_refused(length, angle):
     In one increment the longer blade passes through the block. The shorter one does not reach it:
     no force.
     """
-    all_around = either(*(near(i, value) for i in (0, 1) for value in (0.0, 1.0)))
+    all_around = any_of(*(at_coordinate(i, value) for i in (0, 1) for value in (0.0, 1.0)))
     body = Bodies(boxes([[np.linspace(0.0, 1.0, 5)] * 2], {SIDES: all_around}), E, 0.3)
     body.F += 0.01 * E * ufl.dot(body.u, body.v) * ufl.dx
     turned = body.constant()
@@ -431,7 +444,7 @@ def test_full_turn_of_a_blade_through_a_body_is_refused(length, angle):
 def test_rotation_of_a_frictionless_ball_changes_no_force():
     """A ball is pressed in by 0.005 and turned twice about its centre: same force to 1e-9."""
     body = block()
-    body.hold(TOP, 0, 1)
+    body.prescribe(TOP, 0, 1)
     turned = body.constant()
     ball = fc.Ball((0.5, -0.295), 0.3, rotation=fc.Rotation(turned, (0.5, -0.295)))
     contact = body.contact(BOTTOM, ball, fc.Frictionless(), kinematics="finite")
@@ -451,7 +464,7 @@ def test_rotation_of_a_frictionless_ball_changes_no_force():
 def test_ball_between_quadrature_points_is_detected(kinematics, at):
     """A ball of a fifth of a facet is pressed in by more than its diameter, anywhere on a facet."""
     body = block()
-    body.hold(TOP, 0, 1)
+    body.prescribe(TOP, 0, 1)
     up = body.constant(np.zeros(2))
     ball = fc.Ball((at, -0.0125), 0.0125, displacement=up)
     problem = body.problem(body.contact(BOTTOM, ball, fc.Frictionless(), kinematics=kinematics))
@@ -480,8 +493,8 @@ def test_penetration_of_open_points_is_detected(kind):
     rests = kind == "rests"
     body = block(bend=step if rests else None, low=0.0 if rests else 0.05, length=2.0, n=(20, 5))
     along = body.constant()
-    body.hold(TOP, 1, value=-0.005 if rests else 0.0)
-    body.hold(TOP, 0, value=along)
+    body.prescribe(TOP, 1, value=-0.005 if rests else 0.0)
+    body.prescribe(TOP, 0, value=along)
     floor = [[5, 0], [3.2, 0], [2.9, 0.12], [2.6, 0.25], [2.3, 0.12], [2, 0], [1, 0], [-3, 0]]
     contact = body.contact(BOTTOM, fc.RigidProfile(np.array(floor, dtype=float)), fc.Frictionless())
     problem = body.problem(contact)
@@ -495,8 +508,8 @@ def test_penetration_of_open_points_is_detected(kind):
 
 @pytest.mark.each
 @KINEMATICS
-@pytest.mark.parametrize("way", [0.3, 0.7, 2.5])
-def test_body_does_not_enter_another_one_sideways(kinematics, way):
+@pytest.mark.parametrize("displacement", [0.3, 0.7, 2.5])
+def test_body_does_not_enter_another_one_sideways(kinematics, displacement):
     """A block above a floor, with its underside as Γc, moves into a post, or past it."""
     axes = [
         [np.linspace(0.0, 1.0, 9), 0.3 + np.linspace(0.0, 0.5, 5)],
@@ -505,26 +518,30 @@ def test_body_does_not_enter_another_one_sideways(kinematics, way):
     ]
 
     def post(x, cell):
-        return near(0, 1.5)(x, cell) | near(0, 1.8)(x, cell) | near(1, 0.5)(x, cell)
+        return (
+            at_coordinate(0, 1.5)(x, cell)
+            | at_coordinate(0, 1.8)(x, cell)
+            | at_coordinate(1, 0.5)(x, cell)
+        )
 
     sides = {
-        BOTTOM: near(1, 0.3),
-        TOP: near(1, 0.8),
-        FLOOR: between(1, 0.0, above=False),
-        HELD: near(1, -0.5),
-        6: between(1, 0.0, above=True),
+        BOTTOM: at_coordinate(1, 0.3),
+        TOP: at_coordinate(1, 0.8),
+        FLOOR: at_interface(1, 0.0, above=False),
+        HELD: at_coordinate(1, -0.5),
+        6: at_interface(1, 0.0, above=True),
         SIDES: post,
     }
     body = Bodies(boxes(axes, sides), E, 0.3)
     along = body.constant()
-    body.hold(HELD, 0, 1)
-    body.hold(6, 0, 1)
-    body.hold(TOP, 1)
-    body.hold(TOP, 0, value=along)
+    body.prescribe(HELD, 0, 1)
+    body.prescribe(6, 0, 1)
+    body.prescribe(TOP, 1)
+    body.prescribe(TOP, 0, value=along)
     opposite = fc.DeformableBody(body.tags, (FLOOR, SIDES))
     problem = body.problem(body.contact(BOTTOM, opposite, fc.Frictionless(), kinematics=kinematics))
-    along.value = way
-    if way < 0.5:  # ends before the post
+    along.value = displacement
+    if displacement < 0.5:  # ends before the post
         assert problem.solve().verdict.failures == []
     else:
         fails(problem, "crossed")
@@ -544,16 +561,16 @@ def test_points_that_slide_off_the_other_body_carry_no_force(enforcement):
             [np.linspace(1.0, 2.0, 9), 0.5 + np.linspace(0.0, 0.5, 5)],
         ]
         sides = {
-            HELD: near(1, 0.0),
-            FLOOR: between(1, 0.5, above=False),
-            BOTTOM: between(1, 0.5, above=True),
-            TOP: near(1, 1.0),
+            HELD: at_coordinate(1, 0.0),
+            FLOOR: at_interface(1, 0.5, above=False),
+            BOTTOM: at_interface(1, 0.5, above=True),
+            TOP: at_coordinate(1, 1.0),
         }
         body = Bodies(boxes(axes, sides), E, 0.3)
         along = body.constant()
-        body.hold(HELD, 0, 1)
-        body.hold(TOP, 1, value=-0.01)
-        body.hold(TOP, 0, value=along)
+        body.prescribe(HELD, 0, 1)
+        body.prescribe(TOP, 1, value=-0.01)
+        body.prescribe(TOP, 0, value=along)
         contact = body.contact(
             BOTTOM, FLOOR, fc.Frictionless(), kinematics=kinematics, enforcement=enforcement
         )
@@ -582,19 +599,19 @@ def test_end_face_of_a_slab_is_not_taken_for_penetration():
             [np.linspace(0.5, 1.5, 8), 1.0 + np.linspace(0.0, 1.0, 8)],
         ]
         sides = {
-            HELD: near(1, 0.0),
-            FLOOR: between(1, 1.0, above=False),
-            SIDES: near(0, 2.0),
-            BOTTOM: between(1, 1.0, above=True),
-            TOP: near(1, 2.0),
+            HELD: at_coordinate(1, 0.0),
+            FLOOR: at_interface(1, 1.0, above=False),
+            SIDES: at_coordinate(0, 2.0),
+            BOTTOM: at_interface(1, 1.0, above=True),
+            TOP: at_coordinate(1, 2.0),
         }
         mesh, facets = boxes(axes, sides)
         softer = ufl.conditional(ufl.SpatialCoordinate(mesh)[1] > 1.0, 0.5 * E, E)
         body = Bodies((mesh, facets), softer, 0.3)
         along = body.constant()
-        body.hold(HELD, 0, 1)
-        body.hold(TOP, 1, value=-0.01)
-        body.hold(TOP, 0, value=along)
+        body.prescribe(HELD, 0, 1)
+        body.prescribe(TOP, 1, value=-0.01)
+        body.prescribe(TOP, 0, value=along)
         contact = body.contact(BOTTOM, tags, fc.Coulomb(0.2), kinematics="finite")
         problem = body.problem(contact)
         found = []
@@ -616,15 +633,15 @@ def test_pin_next_to_closed_facets_is_detected(kinematics):
         [1.25 + width * np.linspace(-0.5, 0.5, 3), 0.5 + np.linspace(0.0, 0.5, 4)],
     ]
     sides = {
-        BOTTOM: between(1, 0.5, above=False),
-        FLOOR: between(1, 0.5, above=True),
-        HELD: near(1, 0.0),
-        TOP: near(1, 1.0),
+        BOTTOM: at_interface(1, 0.5, above=False),
+        FLOOR: at_interface(1, 0.5, above=True),
+        HELD: at_coordinate(1, 0.0),
+        TOP: at_coordinate(1, 1.0),
     }
     body = Bodies(boxes(axes, sides), E, 0.3)
-    body.hold(HELD, 0, 1)
-    body.hold(TOP, 0)
-    body.hold(TOP, 1, value=-5e-3)
+    body.prescribe(HELD, 0, 1)
+    body.prescribe(TOP, 0)
+    body.prescribe(TOP, 1, value=-5e-3)
     problem = body.problem(
         body.contact(BOTTOM, FLOOR, fc.Frictionless(), kinematics=kinematics, quadrature=2)
     )
@@ -645,18 +662,18 @@ def test_crossing_ridges_are_detected(kinematics, both):
         return x
 
     sides = {
-        BOTTOM: between(2, 0.5, above=False),
-        FLOOR: between(2, 1.4, above=True),
-        HELD: near(2, 0.0),
-        TOP: near(2, 1.9),
+        BOTTOM: at_interface(2, 0.5, above=False),
+        FLOOR: at_interface(2, 1.4, above=True),
+        HELD: at_coordinate(2, 0.0),
+        TOP: at_coordinate(2, 1.9),
     }
     body = Bodies(
         boxes([[lines, lines, rise], [lines, lines, 1.4 + rise]], sides, bend=ridges), E, 0.3
     )
     down = body.constant()
-    body.hold(HELD, 0, 1, 2)
-    body.hold(TOP, 0, 1)
-    body.hold(TOP, 2, value=down)
+    body.prescribe(HELD, 0, 1, 2)
+    body.prescribe(TOP, 0, 1)
+    body.prescribe(TOP, 2, value=down)
     faces = [(BOTTOM, FLOOR), (FLOOR, BOTTOM)][: 1 + both]
     contacts = [
         body.contact(*face, fc.Frictionless(), kinematics=kinematics, name=f"side {i}")
@@ -677,8 +694,8 @@ def test_undeformed_vertex_at_a_singular_distance_is_accepted():
     """
     body = block()
     lead, shift = body.constant(), body.constant((0.0, -0.25))
-    body.hold(TOP, 0)
-    body.hold(TOP, 1, value=lead)
+    body.prescribe(TOP, 0)
+    body.prescribe(TOP, 1, value=lead)
     ball = fc.SignedDistance(lambda x: ufl.sqrt(x[1] ** 2 + (x[0] - 0.5) ** 2) - 0.2, shift)
     surface = fc.ContactSurface(body.mesh, body.tags, BOTTOM, quadrature_scheme="vertex")
     contact = fc.Contact(body.u, surface, ball, fc.Frictionless(), kinematics="finite")
@@ -703,17 +720,17 @@ def test_soft_contact_with_large_penetration_keeps_its_pairs(tags):
     """
     axes = [[np.linspace(0.0, 1.0, 5), y + np.linspace(0.0, 1.0, 5)] for y in (0.0, 1.0)]
     sides = {
-        HELD: near(1, 0.0),
-        FLOOR: between(1, 1.0, above=False),
-        BOTTOM: between(1, 1.0, above=True),
-        TOP: near(1, 2.0),
-        SIDES: near(0, 0.0),
+        HELD: at_coordinate(1, 0.0),
+        FLOOR: at_interface(1, 1.0, above=False),
+        BOTTOM: at_interface(1, 1.0, above=True),
+        TOP: at_coordinate(1, 2.0),
+        SIDES: at_coordinate(0, 0.0),
     }
     bodies = Bodies(boxes(axes, sides), E, 0.3)
     down = bodies.constant()
-    bodies.hold(HELD, 1)
-    bodies.hold(SIDES, 0)
-    bodies.hold(TOP, 1, value=down)
+    bodies.prescribe(HELD, 1)
+    bodies.prescribe(SIDES, 0)
+    bodies.prescribe(TOP, 1, value=down)
     k = 1e-3 * E / 0.25
     contact = bodies.contact(tags[0], (tags[1],), fc.Frictionless(k), kinematics="finite")
     problem = bodies.problem(contact)
@@ -737,11 +754,15 @@ def test_block_with_its_sides_in_the_contact_surface_slides(n, kinematics):
     Reference: friction μ N in full slip, to 1e-9.
     """
     axes = [[np.linspace(0.0, 1.0, n[0] + 1), np.linspace(0.0, 0.5, n[1] + 1)]]
-    tags = {BOTTOM: near(1, 0.0), TOP: near(1, 0.5), SIDES: either(near(0, 0.0), near(0, 1.0))}
+    tags = {
+        BOTTOM: at_coordinate(1, 0.0),
+        TOP: at_coordinate(1, 0.5),
+        SIDES: any_of(at_coordinate(0, 0.0), at_coordinate(0, 1.0)),
+    }
     body = Bodies(boxes(axes, tags), E, 0.3)
     down, along = body.constant(-1e-3), body.constant()
-    body.hold(TOP, 1, value=down)
-    body.hold(TOP, 0, value=along)
+    body.prescribe(TOP, 1, value=down)
+    body.prescribe(TOP, 0, value=along)
     surface = fc.ContactSurface(body.mesh, body.tags, [BOTTOM, SIDES])
     floor = fc.HalfSpace((0.0, 0.0), (0.0, 1.0))
     contact = fc.Contact(body.u, surface, floor, fc.Coulomb(0.3), kinematics=kinematics)
@@ -760,17 +781,17 @@ def test_roller_passes_the_end_of_a_block_and_returns(n):
     Without friction the forces of the return agree with those of the outward motion to 1e-6.
     """
     axes = [[np.linspace(0.0, 1.0, n + 1), np.linspace(0.0, 1.0, n + 1)]]
-    tags = {BOTTOM: near(1, 0.0), TOP: near(1, 1.0), SIDES: near(0, 1.0)}
+    tags = {BOTTOM: at_coordinate(1, 0.0), TOP: at_coordinate(1, 1.0), SIDES: at_coordinate(0, 1.0)}
     body = Bodies(boxes(axes, tags, simplex=True), E, 0.3)
-    body.hold(TOP, 0, 1)
+    body.prescribe(TOP, 0, 1)
     shift = body.constant((0.0, 0.01))
     roller = fc.Ball((0.6, -0.3), 0.3, displacement=shift)
     surface = fc.ContactSurface(body.mesh, body.tags, [BOTTOM, SIDES])
     contact = fc.Contact(body.u, surface, roller, fc.Frictionless(), kinematics="finite")
     problem = body.problem(contact)
     forces = []
-    for way in [*np.arange(0.0, 1.3, 0.2), *np.arange(1.0, -0.1, -0.2)]:
-        shift.value[0] = way
+    for displacement in [*np.arange(0.0, 1.3, 0.2), *np.arange(1.0, -0.1, -0.2)]:
+        shift.value[0] = displacement
         problem.solve()
         problem.commit()
         forces.append(contact.resultants().force)
@@ -794,8 +815,8 @@ def test_penetration_of_nodes_off_quadrature_points_is_refused(cell, kinematics,
     body = LinearElastic(u, E, 0.45, {2: "plane strain", 3: "3D"}[d])
     F = body.residual(ufl.TestFunction(u.function_space), ufl.dx(mesh))
     down = fem.Constant(mesh, 0.0)
-    bcs = [hold(u, tags, BLOCK_TOP, i) for i in range(d - 1)]
-    bcs.append(hold(u, tags, BLOCK_TOP, d - 1, down))
+    bcs = [dirichlet_bc(u, tags, BLOCK_TOP, i) for i in range(d - 1)]
+    bcs.append(dirichlet_bc(u, tags, BLOCK_TOP, d - 1, down))
     centre, up = np.full(d, 0.5), np.eye(d)[-1]
     centre[-1] = -100.0
     angle = fem.Constant(mesh, 0.0)

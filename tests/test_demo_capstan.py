@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import run_demo, values
+from scenes.processes import reference_values, run_demo
 
 pytestmark = [
     pytest.mark.demo,
@@ -24,7 +24,7 @@ def test_tension_of_the_fixed_end(tmp_path: Path) -> None:
     before the end: the last increments change nothing.
     """
     result = run_demo("capstan", tmp_path, *OPTIONS)
-    found = values(result)
+    found = reference_values(result)
     for t in (1.0, 0.5):
         lacks = 1 - found[f"ln(T2/T1), t = {t:g}"] / (0.3 * math.pi)
         assert t / 20 < lacks < 1.25 * t / 20
@@ -43,5 +43,5 @@ def test_two_ranks_agree(tmp_path: Path) -> None:
     options = ("--thickness", "1", "--cells", "12")
     serial = run_demo("capstan", tmp_path / "1", *options)
     parallel = run_demo("capstan", tmp_path / "2", *options, ranks=2)
-    for name, value in values(serial).items():
-        assert values(parallel)[name] == pytest.approx(value, rel=1e-6)
+    for name, value in reference_values(serial).items():
+        assert reference_values(parallel)[name] == pytest.approx(value, rel=1e-6)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import run_demo, values
+from scenes.processes import reference_values, run_demo
 
 pytestmark = [
     pytest.mark.demo,
@@ -22,7 +22,7 @@ def test_torque_of_full_slip(tmp_path: Path) -> None:
     slip is a part of it. Rotating the whole scene as well changes nothing, to 1e-7.
     """
     result = run_demo("clutch", tmp_path)
-    found, path = values(result), result["path"]
+    found, path = reference_values(result), result["path"]
     last = path[-1]
     assert last["angle"] == 90.0
     assert last["torque"] == pytest.approx(0.3 * last["force"] * 15.5556, rel=0.02)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import run_demo, values
+from scenes.processes import reference_values, run_demo
 
 pytestmark = [
     pytest.mark.demo,
@@ -22,7 +22,7 @@ def test_statics_and_homogeneity(tmp_path: Path) -> None:
     P = 0.02656 · 6.4 · 43 daN; the flank rises by 40 mm over 22 mm.
     """
     result = run_demo("fitting", tmp_path)
-    found = values(result)
+    found = reference_values(result)
     half = 0.02656 * 6.4 * 43 / 2
     length = math.hypot(22, 40)
     sine, cosine = 22 / length, 40 / length

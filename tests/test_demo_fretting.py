@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import run_demo, values
+from scenes.processes import reference_values, run_demo
 
 pytestmark = [
     pytest.mark.demo,
@@ -35,7 +35,7 @@ def test_fretting_loop_agrees_with_mindlin(tmp_path: Path) -> None:
     at the points has no such error. After a load reversal slip starts from zero again.
     """
     result = run_demo("fretting", tmp_path)
-    found = values(result)
+    found = reference_values(result)
     assert found["loop area [mJ/mm]"] == pytest.approx(energy(0.7), rel=0.01)
     assert found["dissipated energy [mJ/mm]"] == pytest.approx(energy(0.7), rel=0.005)
     assert found["closing error of the loop / width"] <= 1e-4
@@ -60,4 +60,4 @@ def test_two_ranks_agree(tmp_path: Path) -> None:
     options = ("--cells", "16", "--increments", "5")
     serial = run_demo("fretting", tmp_path / "1", *options)
     parallel = run_demo("fretting", tmp_path / "2", *options, ranks=2)
-    assert values(parallel) == pytest.approx(values(serial), rel=1e-6, abs=1e-6)
+    assert reference_values(parallel) == pytest.approx(reference_values(serial), rel=1e-6, abs=1e-6)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import run_demo, values
+from scenes.processes import reference_values, run_demo
 
 pytestmark = [
     pytest.mark.demo,
@@ -40,7 +40,7 @@ def test_two_ranks_agree(tmp_path: Path) -> None:
     options = ("--cells", "18", "--increments", "2")
     serial = run_demo("incline", tmp_path / "1", *options)
     parallel = run_demo("incline", tmp_path / "2", *options, ranks=2)
-    assert values(parallel) == pytest.approx(values(serial), rel=1e-6, abs=1e-7)
+    assert reference_values(parallel) == pytest.approx(reference_values(serial), rel=1e-6, abs=1e-7)
     for one, two in zip(serial["pushed"], parallel["pushed"], strict=True):
         for a, b in zip(one["rows"], two["rows"], strict=True):
             assert b["F/G"] == pytest.approx(a["F/G"], rel=1e-6)

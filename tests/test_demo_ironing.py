@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import run_demo, values
+from scenes.processes import reference_values, run_demo
 
 pytestmark = [
     pytest.mark.demo,
@@ -25,7 +25,7 @@ def test_sliding_cylinder_agrees_with_johnson(tmp_path: Path) -> None:
     force is prescribed, and the height of the cylinder unknown.
     """
     result = run_demo("ironing", tmp_path, *OPTIONS)
-    found = values(result)
+    found = reference_values(result)
     assert found["half-width [mm]"] == pytest.approx(0.2505, rel=0.02)
     assert found["peak pressure [MPa]"] == pytest.approx(11.445, rel=0.02)
     assert found["vertical force [N/mm]"] == pytest.approx(4.5, rel=1e-6)
@@ -42,5 +42,5 @@ def test_two_ranks_agree(tmp_path: Path) -> None:
     options = ("--cells", "5", "--increments", "4")
     serial = run_demo("ironing", tmp_path / "1", *options)
     parallel = run_demo("ironing", tmp_path / "2", *options, ranks=2)
-    for name, value in values(serial).items():
-        assert values(parallel)[name] == pytest.approx(value, rel=1e-6, abs=1e-6)
+    for name, value in reference_values(serial).items():
+        assert reference_values(parallel)[name] == pytest.approx(value, rel=1e-6, abs=1e-6)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import run_demo, values
+from scenes.processes import reference_values, run_demo
 
 pytestmark = [
     pytest.mark.demo,
@@ -22,7 +22,7 @@ def test_forces_and_torque(tmp_path: Path) -> None:
     The references have six decimals. The disc slips before it is dragged.
     """
     result = run_demo("rolling", tmp_path)
-    found = values(result)
+    found = reference_values(result)
     wanted = {"normal, t = 1": 3003.797966, "torque, t = 2": 4049.434181, "drag, t = 3": 800.943243}
     for name, value in wanted.items():
         assert found[name] == pytest.approx(value, rel=1e-6)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import run_demo, values
+from scenes.processes import reference_values, run_demo
 
 pytestmark = [
     pytest.mark.demo,
@@ -24,7 +24,7 @@ def test_torque_over_axial_force(tmp_path: Path) -> None:
     contribution of friction by a thousandth.
     """
     result = run_demo("screw", tmp_path, "--friction", "0.2", "--cells", "3")
-    found = values(result)
+    found = reference_values(result)
     alpha, phi = np.arctan(0.3), np.arctan(0.2)
     assert found["μ = 0: largest |M / (F P) - 1|"] < 1e-9
     assert found["raising, M / (F R)"] == pytest.approx(np.tan(alpha + phi), abs=3e-4)

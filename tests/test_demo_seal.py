@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import run_demo, values
+from scenes.processes import reference_values, run_demo
 
 pytestmark = [
     pytest.mark.demo,
@@ -22,7 +22,7 @@ def test_force_over_compression(tmp_path: Path) -> None:
     its outer wall, and increases the final force by about half (at least 30 %).
     """
     result = run_demo("seal", tmp_path)
-    found = values(result)
+    found = reference_values(result)
     for c, force in ((0.15, 2.196), (0.2, 3.450), (0.25, 5.054)):
         assert found[f"force at c = {c:g} [N/mm]"] == pytest.approx(force, rel=0.05)
     free, held = result["forces"]["between plates"], result["forces"]["in a groove"]
@@ -37,5 +37,5 @@ def test_two_ranks_agree(tmp_path: Path) -> None:
     """Results on two ranks agree to 1e-6; the solver's tolerance is 1e-9 of the forces."""
     serial = run_demo("seal", tmp_path / "1")
     parallel = run_demo("seal", tmp_path / "2", ranks=2)
-    for name, value in values(serial).items():
-        assert values(parallel)[name] == pytest.approx(value, rel=1e-6)
+    for name, value in reference_values(serial).items():
+        assert reference_values(parallel)[name] == pytest.approx(value, rel=1e-6)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import run_demo, values
+from scenes.processes import reference_values, run_demo
 
 pytestmark = [
     pytest.mark.demo,
@@ -23,7 +23,7 @@ def test_pressing_and_first_sliding(tmp_path: Path) -> None:
     """
     options = ("--increments", "250", "--until", "1.06")
     result = run_demo("shallow_ironing", tmp_path, *options)
-    assert 268.0 < values(result)["V, t = 1"] < 332.0
+    assert 268.0 < reference_values(result)["V, t = 1"] < 332.0
     sliding = [row for row in result["path"] if row["time"] > 1.045]
     assert all(row["stick"] == 0 and row["slip"] > 0 for row in sliding)
     assert sum(row["iterations"] for row in sliding) <= 8 * len(sliding)
@@ -34,6 +34,6 @@ def test_pressing_and_first_sliding(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_dragging_by_four_times_the_die(tmp_path: Path) -> None:
     """V(1.5) and H(1.5) are in the published ranges."""
-    found = values(run_demo("shallow_ironing", tmp_path, "--until", "1.5"))
+    found = reference_values(run_demo("shallow_ironing", tmp_path, "--until", "1.5"))
     assert 337.0 < found["V, t = 1.5"] < 421.0
     assert 102.0 < found["H, t = 1.5"] < 189.0

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import run_demo, values
+from scenes.processes import reference_values, run_demo
 
 pytestmark = [
     pytest.mark.demo,
@@ -24,7 +24,7 @@ def test_insertion_release_and_extraction(tmp_path: Path) -> None:
     remains, to 2 % (the end of the pin outside of the hub is a fortieth of the joint).
     """
     result = run_demo("tapered_pin", tmp_path, "--cells", "20")
-    found = values(result)
+    found = reference_values(result)
     assert found["mean pressure, insertion [MPa]"] == pytest.approx(205.4, rel=5e-3)
     assert found["dry, insertion force [N]"] == pytest.approx(82.6e3, rel=5e-3)
     assert found["dry, extraction force [N]"] == pytest.approx(71.2e3, rel=5e-3)
@@ -48,4 +48,4 @@ def test_two_ranks_agree(tmp_path: Path) -> None:
     """Results on two ranks agree to 1e-6, relative or absolute; the solver's tolerance is 1e-9."""
     serial = run_demo("tapered_pin", tmp_path / "1", "--cells", "20")
     parallel = run_demo("tapered_pin", tmp_path / "2", "--cells", "20", ranks=2)
-    assert values(parallel) == pytest.approx(values(serial), rel=1e-6, abs=1e-6)
+    assert reference_values(parallel) == pytest.approx(reference_values(serial), rel=1e-6, abs=1e-6)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import run_demo, values
+from scenes.processes import reference_values, run_demo
 
 pytestmark = [
     pytest.mark.demo,
@@ -23,7 +23,7 @@ def test_forces_before_and_after_the_tube_closes(tmp_path: Path) -> None:
     through each other under the force at closing, a twelfth of the last.
     """
     result = run_demo("tube", tmp_path)
-    found = values(result)
+    found = reference_values(result)
     assert found["compliance, vertical [mm²/N]"] == pytest.approx(64.368, rel=0.015)
     assert found["compliance, horizontal [mm²/N]"] == pytest.approx(56.207, rel=0.015)
     whole, quarter = (result["forces"][name] for name in ("tube", "quarter"))
@@ -43,5 +43,5 @@ def test_two_ranks_agree(tmp_path: Path) -> None:
     """Results on two ranks agree to 1e-6: the solver's tolerance is 1e-9 of the forces."""
     serial = run_demo("tube", tmp_path / "1")
     parallel = run_demo("tube", tmp_path / "2", ranks=2)
-    for name, value in values(serial).items():
-        assert values(parallel)[name] == pytest.approx(value, rel=1e-6)
+    for name, value in reference_values(serial).items():
+        assert reference_values(parallel)[name] == pytest.approx(value, rel=1e-6)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import run_demo, values
+from scenes.processes import reference_values, run_demo
 
 pytestmark = [
     pytest.mark.demo,
@@ -22,7 +22,7 @@ def test_cattaneo_mindlin(tmp_path: Path) -> None:
     forces are those of the loads, to 1e-7.
     """
     result = run_demo("two_cylinders", tmp_path)
-    found = values(result)
+    found = reference_values(result)
     assert found["force along y [N/mm]"] == pytest.approx(16 * 0.625, rel=1e-7)
     assert found["force along x [N/mm]"] == pytest.approx(16 * 0.05851, rel=1e-7)
     assert found["half-width of contact [mm]"] == pytest.approx(0.68078, rel=0.02)
@@ -43,7 +43,7 @@ def test_number_of_increments_has_no_effect(tmp_path: Path) -> None:
     """
     once = run_demo("two_cylinders", tmp_path / "1", "--cells", "20", "--increments", "1")
     often = run_demo("two_cylinders", tmp_path / "4", "--cells", "20", "--increments", "4")
-    assert values(once) == pytest.approx(values(often), rel=1e-3)
+    assert reference_values(once) == pytest.approx(reference_values(often), rel=1e-3)
 
 
 @pytest.mark.slow
@@ -52,4 +52,4 @@ def test_two_ranks_agree(tmp_path: Path) -> None:
     options = ("--cells", "20", "--increments", "1")
     serial = run_demo("two_cylinders", tmp_path / "1", *options)
     parallel = run_demo("two_cylinders", tmp_path / "2", *options, ranks=2)
-    assert values(parallel) == pytest.approx(values(serial), rel=1e-6)
+    assert reference_values(parallel) == pytest.approx(reference_values(serial), rel=1e-6)

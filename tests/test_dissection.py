@@ -6,7 +6,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact.systems.dissection import BlockFactorisation, Dissection
-from scenes.comparing import close
+from scenes.comparison import is_close
 
 pytestmark = pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="every rank does it by itself")
 
@@ -60,18 +60,18 @@ def test_dissection_agrees_with_dense_algebra(symmetric, shift, inner):
     inverse = np.linalg.inv(K[np.ix_(inside, inside)])
     away = K[np.ix_(stays, inside)] @ inverse
     schur = K[np.ix_(stays, stays)] - away @ K[np.ix_(inside, stays)]
-    assert close(made.schur, schur, 1e-10)
+    assert is_close(made.schur, schur, 1e-10)
     assert made.release().shape == schur.shape and not made.schur.size
     rng = np.random.default_rng(6)
     force, boundary = np.zeros(n), rng.normal(size=stays.size)
     force[inside] = rng.normal(size=inside.size)
     partial = made.eliminate(force)
-    assert close(partial.reduced_rhs[stays], -away @ force[inside], 1e-10)
+    assert is_close(partial.reduced_rhs[stays], -away @ force[inside], 1e-10)
     for given, load in ((boundary, 0 * force), (0 * boundary, force), (boundary, force)):
         expected = np.zeros(n)
         expected[stays] = given
         expected[inside] = inverse @ (load[inside] - K[np.ix_(inside, stays)] @ given)
-        assert close(made.back_substitute(given, made.eliminate(load)), expected, 1e-10)
+        assert is_close(made.back_substitute(given, made.eliminate(load)), expected, 1e-10)
 
 
 def test_singular_block_is_refused():

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import ROOT, command, environment
+from scenes.processes import ROOT, command, subprocess_environment
 
 pytestmark = [
     pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts a process of its own"),
@@ -62,7 +62,9 @@ def test_more_ranks_than_cores_start_without_warnings() -> None:
     """More ranks than cores start, and print nothing but their own output."""
     ranks = (os.cpu_count() or 1) + 1
     words = command(ranks, "-c", "print('here')")
-    process = subprocess.run(words, env=environment(), capture_output=True, text=True, timeout=60)
+    process = subprocess.run(
+        words, env=subprocess_environment(), capture_output=True, text=True, timeout=60
+    )
     assert (process.returncode, process.stdout, process.stderr) == (0, "here\n" * ranks, "")
 
 

@@ -14,7 +14,7 @@ import pytest
 from mpi4py import MPI
 
 import fenics_contact
-from scenes.processes import ROOT, command, environment
+from scenes.processes import ROOT, command, subprocess_environment
 
 sys.path.insert(0, str(ROOT / "docs"))
 
@@ -268,7 +268,9 @@ def test_documented_line_ends_all_ranks(tmp_path: Path) -> None:
         "MPI.COMM_WORLD.Barrier()\n"
     )
     words = command(2, script)
-    done = subprocess.run(words, env=environment(), capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        words, env=subprocess_environment(), capture_output=True, text=True, timeout=60
+    )
     assert done.returncode != 0 and "ValueError: on one rank" in done.stderr
 
 
@@ -297,7 +299,7 @@ def test_scripts_run(path: Path, tmp_path: Path) -> None:
         done = subprocess.run(
             [sys.executable, str(path)],
             cwd=tmp_path,
-            env=environment(),
+            env=subprocess_environment(),
             capture_output=True,
             text=True,
             timeout=300,

@@ -9,11 +9,11 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.estimates.errors import quantities
+from scenes.block_on_ball import ObliqueBlockOnBall, supporting_ball
 from scenes.blocks import BOTTOM, GRID, LEFT, TOP, block, block_mesh
-from scenes.comparing import close, nodal, raised_everywhere, shared_folder
+from scenes.comparison import assert_raised_on_all_ranks, is_close, nodal_values, shared_folder
 from scenes.elasticity import displacement_space, stress
-from scenes.histories import Press
-from scenes.rubbing import Aslant, cushion
+from scenes.histories import BlockOnBallHistory
 
 COMM = MPI.COMM_WORLD
 # Accepted effectivity of an estimate: estimated over true error.
@@ -24,9 +24,9 @@ def budget(scene, problem, **kwargs):
     return fc.estimate_errors(problem, stress(scene.u, scene.E, scene.nu), **kwargs)
 
 
-def press(*, n=8, k=1e4, friction=0.3, **options) -> Aslant:
+def press(*, n=8, k=1e4, friction=0.3, **options) -> ObliqueBlockOnBall:
     law = fc.Coulomb(friction, k, k) if friction else fc.Frictionless(k)
-    return Aslant(law, mesh={"n": n}, **options)
+    return ObliqueBlockOnBall(law, mesh={"n": n}, **options)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -41,13 +41,13 @@ def test_enforcement_of_uniform_pressure(cell, degree, method):
     problem, _ = scene.problem(fc.Frictionless(k), scene.rollers(), method=method)
     problem.solve()
     found = budget(scene, problem)
-    assert close(found.parts["enforcement"]["displacement"], p / k, 1e-8)
+    assert is_close(found.parts["enforcement"]["displacement"], p / k, 1e-8)
     size = found.values
     for part in ("enforcement", "discretisation", "kinematics", "solver"):
         for name in ("normal force", "peak pressure"):
             assert abs(found.parts[part][name]) <= 1e-8 * size[name], (part, name)
     assert abs(found.parts["discretisation"]["displacement"]) <= 1e-8 * size["displacement"]
-    assert close(size["peak pressure"], p, 1e-8)
+    assert is_close(size["peak pressure"], p, 1e-8)
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
@@ -83,7 +83,7 @@ def test_discretisation_of_sliding():
     assert made.contact.resultants().stick == 0
     found = budget(made.scene, made.problem).parts["discretisation"]
     assert found["normal force"] != 0
-    assert close(found["friction force"], 0.3 * found["normal force"], 1e-6)
+    assert is_close(found["friction force"], 0.3 * found["normal force"], 1e-6)
 
 
 def test_increment_error():
@@ -116,7 +116,7 @@ def test_solver_error(condensation):
     name = "normal force"
     error = found.values[name] - truth[name]
     assert abs(error) > 1e-7 * truth[name]
-    assert close(found.parts["solver"][name], error, 0.01)
+    assert is_close(found.parts["solver"][name], error, 0.01)
 
 
 def test_estimate_changes_no_state():
@@ -139,7 +139,7 @@ def test_estimate_changes_no_state():
             assert set(again.parts) == {"enforcement", "discretisation", "kinematics", "solver"}
         made.load(1.0)
         made.problem.solve()
-    assert close(nodal(asked.scene.u), nodal(plain.scene.u), 1e-9)
+    assert is_close(nodal_values(asked.scene.u), nodal_values(plain.scene.u), 1e-9)
 
 
 def test_estimate_is_the_same_before_and_after_commit():
@@ -152,7 +152,7 @@ def test_estimate_is_the_same_before_and_after_commit():
     after = budget(made.scene, made.problem)
     for part in before.parts:
         for name, value in before.parts[part].items():
-            assert close(after.parts[part][name], value, 1e-6, scale=abs(before.values[name]))
+            assert is_close(after.parts[part][name], value, 1e-6, scale=abs(before.values[name]))
 
 
 def test_table_of_the_budget():
@@ -165,7 +165,7 @@ def test_table_of_the_budget():
     assert found.dominant in lines[6]
     total = found.total["normal force"]
     squares = [found.relative(p)["normal force"] ** 2 for p in found.parts]
-    assert close(total, np.sqrt(sum(squares)), 1e-14)
+    assert is_close(total, np.sqrt(sum(squares)), 1e-14)
     assert "not estimated" in str(budget(made.scene, made.problem))
 
     scene = block("quadrilateral", 1, n=4, up=-1.0)
@@ -184,7 +184,7 @@ def test_few_facets_in_contact_are_reported(cell, n):
     problem, _ = scene.problem(fc.Frictionless(k_n=1e3), scene.rollers())
     problem.solve()
     found = budget(scene, problem)
-    assert close(found.across, n, 1e-12)
+    assert is_close(found.across, n, 1e-12)
     assert ("unreliable with fewer" in str(found)) == (n < 5)
 
 
@@ -202,14 +202,17 @@ def test_units_do_not_matter():
     for length, pressure in ((1.0, 1.0), (1e-3, 1e6)):
         scene = block("triangle", 2, n=3, size=[length] * 2, E=1e3 * pressure)
         law = fc.Coulomb(0.3, fc.RelativeStiffness(10.0), fc.RelativeStiffness(10.0))
-        bcs = [scene.hold(TOP, 0, 0.01 * length), scene.hold(TOP, 1, -0.03 * length)]
+        bcs = [
+            scene.dirichlet_bc(TOP, 0, 0.01 * length),
+            scene.dirichlet_bc(TOP, 1, -0.03 * length),
+        ]
         problem, _ = scene.problem(
-            law, bcs, contact={"obstacle": cushion(2, length=length)}, method="newton"
+            law, bcs, contact={"obstacle": supporting_ball(2, length=length)}, method="newton"
         )
         problem.solve()
         made = budget(scene, problem)
         found.append([v for part in made.parts for v in made.relative(part).values()])
-    assert close(found[1], found[0], 1e-8, scale=1.0)
+    assert is_close(found[1], found[0], 1e-8, scale=1.0)
 
 
 def test_shapes_are_checked():
@@ -217,12 +220,12 @@ def test_shapes_are_checked():
     made = press(n=2)
     made.run()
     u = made.scene.u
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: fc.estimate_errors(made.problem, ufl.Identity(3), strain=ufl.sym(ufl.grad(u))),
         ValueError,
         "shape",
     )
-    raised_everywhere(lambda: fc.estimate_errors(made.problem, u), ValueError, "shape")
+    assert_raised_on_all_ranks(lambda: fc.estimate_errors(made.problem, u), ValueError, "shape")
 
 
 @pytest.mark.parametrize("bulk", ["linear", "nonlinear"])
@@ -232,14 +235,14 @@ def test_estimate_with_an_unconstrained_obstacle_is_refused(bulk):
     MUMPS' failure with the singular matrix once remained: the next solution ended in PETSc's error
     76. Reference: the same problem without an estimate, to 1e-8.
     """
-    asked, twin = (Press(obstacle="force", wall=True, bulk=bulk) for _ in range(2))
-    raised_everywhere(
+    asked, twin = (BlockOnBallHistory(obstacle="force", wall=True, bulk=bulk) for _ in range(2))
+    assert_raised_on_all_ranks(
         lambda: budget(asked.scene, asked.problem), ValueError, "not constrained", "obstacle"
     )
     for made in (asked, twin):
         made.load(1.0)
         made.problem.solve()
-    assert close(nodal(asked.scene.u), nodal(twin.scene.u), 1e-8)
+    assert is_close(nodal_values(asked.scene.u), nodal_values(twin.scene.u), 1e-8)
     assert budget(asked.scene, asked.problem).values["floor: normal force"] > 0
 
 
@@ -258,8 +261,8 @@ def test_estimate_continues_from_a_checkpoint(tmp_path):
     again = after.run(steps=3, estimate=True, checkpoint=path)[-1].increment_error
     values = quantities(whole.problem)
     for name, error in end.items():
-        assert close(again[name], error, 1e-7, scale=abs(values[name]))
-    raised_everywhere(
+        assert is_close(again[name], error, 1e-7, scale=abs(values[name]))
+    assert_raised_on_all_ranks(
         lambda: press().run(steps=3, checkpoint=path), ValueError, "estimate", "remove it"
     )
 
@@ -269,8 +272,8 @@ def test_multipliers_have_no_enforcement_error():
     left = {}
     for enforcement in ("penalty", "augmented"):
         scene = block("quadrilateral", 1, n=8)
-        bcs = [scene.hold(TOP, 0, 0.015), scene.hold(TOP, 1, -0.03)]
-        contact = {"obstacle": cushion(2), "enforcement": enforcement}
+        bcs = [scene.dirichlet_bc(TOP, 0, 0.015), scene.dirichlet_bc(TOP, 1, -0.03)]
+        contact = {"obstacle": supporting_ball(2), "enforcement": enforcement}
         problem, _ = scene.problem(fc.Coulomb(0.3, 1e4, 1e4), bcs, contact=contact)
         problem.solve()
         left[enforcement] = budget(scene, problem).relative("enforcement")["normal force"]
@@ -288,7 +291,7 @@ def test_multigrid_gives_the_same_budget():
     direct, multigrid = found
     for part in ("enforcement", "discretisation"):
         for name, value in direct.relative(part).items():
-            assert close(multigrid.relative(part)[name], value, 1e-6, scale=1.0)
+            assert is_close(multigrid.relative(part)[name], value, 1e-6, scale=1.0)
 
 
 @pytest.mark.each
@@ -332,10 +335,10 @@ def test_stresses_of_the_package(kind, bulk):
     gradient = body.strain(u) if bulk == "linear" else ufl.sym(body.gradient(u))
     found = fc.estimate_errors(problem, body.stress)
     expected = fc.estimate_errors(problem, body.stress, strain=gradient)
-    assert close(found.energy, expected.energy, 1e-8) and found.energy > 1e-3
+    assert is_close(found.energy, expected.energy, 1e-8) and found.energy > 1e-3
     for part, errors in expected.parts.items():
         for name, error in errors.items():
-            assert close(found.parts[part][name], error, 1e-8, scale=found.values[name])
+            assert is_close(found.parts[part][name], error, 1e-8, scale=found.values[name])
 
 
 def test_remedy_of_the_small_displacement_error():

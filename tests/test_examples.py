@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
-from scenes.processes import ROOT, command, environment
+from scenes.processes import ROOT, command, subprocess_environment
 
 pytestmark = pytest.mark.whole
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -41,7 +41,7 @@ def run(path: Path, folder: Path, ranks: int) -> str:
     """Return the output of the script, whose exit code must be 0."""
     words = command(ranks, path)
     done = subprocess.run(
-        words, cwd=folder, env=environment(), capture_output=True, text=True, timeout=300
+        words, cwd=folder, env=subprocess_environment(), capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

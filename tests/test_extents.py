@@ -6,9 +6,9 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from demos import two_cylinders as cylinders
+from scenes.block_on_ball import PATH, BlockOnBall, solve_path
 from scenes.blocks import CELLS, dimension
-from scenes.comparing import close
-from scenes.rubbing import PATH, Rub, walk
+from scenes.comparison import is_close
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
@@ -41,7 +41,7 @@ def test_extents_of_hertz_and_cattaneo_mindlin():
         assert abs(middle) < facet / 2
     slip = sheared["slip"]
     assert abs(slip.area - 2 * (a - c)) < 2 * facet
-    assert close([slip.low[0], slip.high[0]], [-a, a], facet / a)
+    assert is_close([slip.low[0], slip.high[0]], [-a, a], facet / a)
 
 
 @pytest.mark.parametrize("cell", CELLS)
@@ -50,10 +50,10 @@ def test_extents_agree_with_the_points(cell):
 
     The extents do not depend on the number of ranks, some of which may have no points of a state.
     """
-    made, d = Rub(cell=cell), dimension(cell)
+    made, d = BlockOnBall(cell=cell), dimension(cell)
     made.problem.small_displacement_tolerance = np.inf
     seen = set()
-    for step in walk(made, path=[(0.0, -0.01), *PATH]):
+    for step in solve_path(made, path=[(0.0, -0.01), *PATH]):
         found, points = step.contacts["contact"], made.contact.gather()
         if step.increment < len(PATH) + 1:
             continue  # the points are those of the last step
@@ -65,7 +65,7 @@ def test_extents_agree_with_the_points(cell):
         }
         for name, mask in states.items():
             extent = found.extents[name]
-            assert close([extent.area], [points["measure"] @ mask], 1e-12, scale=1.0)
+            assert is_close([extent.area], [points["measure"] @ mask], 1e-12, scale=1.0)
             if mask.any():
                 seen.add(name)
                 assert np.array_equal(extent.low, points["x"][mask].min(axis=0))
@@ -78,8 +78,8 @@ def test_extents_agree_with_the_points(cell):
 
 def test_moment_of_a_step_is_about_the_origin():
     """The moment of a step is that of `Contact.moment` about the origin, on any number of ranks."""
-    made = Rub()
+    made = BlockOnBall()
     made.problem.small_displacement_tolerance = np.inf
     *_, step = fc.increments(made.problem, made.load, 0, 1.5, steps=3)
-    assert close(step.contacts["contact"].moment, made.contact.moment([0, 0]), 1e-12)
+    assert is_close(step.contacts["contact"].moment, made.contact.moment([0, 0]), 1e-12)
     assert MPI.COMM_WORLD.allreduce(abs(float(step.contacts["contact"].moment[0]))) > 0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from scenes.comparing import close
+from scenes.comparison import is_close
 from verification.extreme_scenes import pressed, ranked
 from verification.extremes import METHODS, PAGE, Row, Trial, known, page, trials
 
@@ -173,7 +173,7 @@ def test_contact_on_one_rank_only(kind, method):
     _, rows, facets = ranked(kind, 10.0, 0.3, method)
     assert np.count_nonzero(facets) == 1
     _, spread, _ = ranked(kind, 10.0, 0.3, method, apart=False)
-    assert close(rows, spread, 1e-8, scale=np.abs(rows[:, 2:]).max())
+    assert is_close(rows, spread, 1e-8, scale=np.abs(rows[:, 2:]).max())
 
 
 def test_page_agrees_with_stored_rows():

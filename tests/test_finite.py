@@ -11,8 +11,8 @@ from dolfinx import fem
 import fenics_contact as fc
 from fenics_contact.compiling import compile_form
 from fenics_contact.parallel import global_max
-from scenes.blocks import CELLS, wave
-from scenes.comparing import raised_everywhere
+from scenes.blocks import CELLS, rough_field
+from scenes.comparison import assert_raised_on_all_ranks
 from scenes.rubber import disc, rubber
 from scenes.surfaces import ball, circle, ring
 
@@ -80,7 +80,7 @@ def derivative_error(contact, scene, seed, step=1e-6):
     """Return the relative error of tangent times direction by central differences, and scale."""
     u, operator = scene.u, fc.ContactOperator(contact)
     direction = fem.Function(u.function_space)
-    direction.interpolate(wave(scene.dim, seed))
+    direction.interpolate(rough_field(scene.dim, seed))
     start = u.x.array.copy()
 
     def force(share):
@@ -107,7 +107,7 @@ def forces(operator):
 def states(scene, contact, shift, angle, n=3):
     """Yield states of a history in which block and obstacle move, and commit them."""
     for seed in range(n):
-        scene.u.interpolate(lambda x, seed=seed: 0.06 * wave(scene.dim, seed)(x))
+        scene.u.interpolate(lambda x, seed=seed: 0.06 * rough_field(scene.dim, seed)(x))
         shift.value[:] = 0.05 * np.cos(seed + np.arange(scene.dim))
         angle.value = 0.2 * np.sin(seed + 1.0)
         yield seed
@@ -171,7 +171,7 @@ def test_boundary_form_agrees_with_the_operator(cell, shape, enforcement):
         mine, theirs = operator.tangent(), fem.petsc.assemble_matrix(tangent)
         theirs.assemble()
         probe = fem.Function(scene.u.function_space)
-        probe.interpolate(wave(scene.dim, 3))
+        probe.interpolate(rough_field(scene.dim, 3))
         ours, other = (m.createVecLeft() for m in (mine, theirs))
         mine.mult(probe.x.petsc_vec, ours)
         theirs.mult(probe.x.petsc_vec, other)
@@ -186,9 +186,9 @@ def test_frictionless_tangent_is_symmetric():
     assert contact.effective_law.has_potential
     comm, operator = scene.mesh.comm, fc.ContactOperator(contact)
     direction = fem.Function(scene.u.function_space)
-    direction.interpolate(wave(3, 1))
+    direction.interpolate(rough_field(3, 1))
     start = fem.Function(scene.u.function_space)
-    start.interpolate(lambda x: 0.1 * wave(3, 0)(x))
+    start.interpolate(lambda x: 0.1 * rough_field(3, 0)(x))
 
     def energy(step):
         scene.u.x.array[:] = start.x.array + step * direction.x.array
@@ -268,4 +268,4 @@ FLOOR = fc.HalfSpace((0, 1), (0, -1))
 )
 def test_invalid_arguments_are_refused(make, error, text):
     """Creation of the contact raises on all ranks, and the error states a remedy."""
-    raised_everywhere(make, error, text)
+    assert_raised_on_all_ranks(make, error, text)

@@ -11,8 +11,8 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from scenes.comparing import close
-from scenes.rubber import TIGHT, Tool, disc, domed, rubber
+from scenes.comparison import is_close
+from scenes.rubber import TIGHT_TOLERANCE, DiscOnRubber, bend_top, disc, rubber
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(300)]
 COMM = MPI.COMM_WORLD
@@ -38,20 +38,20 @@ def test_moving_the_body_or_the_tool_is_equivalent(cell, shape, enforcement):
     """
     options = {"contact": {"enforcement": enforcement, "tolerance": 1e-9}, "shape": shape}
     allowed = 1e-9 if enforcement == "penalty" else 1e-7
-    one, other = Tool(cell, **options), Tool(cell, **options)
+    one, other = DiscOnRubber(cell, **options), DiscOnRubber(cell, **options)
     for side, up in PATH:
-        one.go(side, up)
+        one.solve_increment(side, up)
         away = one.vector(side, up)[:, None]
-        other.scene.place(lambda x, away=away: x - away)
-        other.go(0.0, 0.0)
+        other.scene.move_bottom(lambda x, away=away: x - away)
+        other.solve_increment(0.0, 0.0)
         assert one.contact.resultants().slip + one.contact.resultants().stick > 0
-        assert close(other.tractions(), one.tractions(), allowed)
+        assert is_close(other.tractions(), one.tractions(), allowed)
 
 
 def _turned(tool, matrix, side, up):
     """Turn block and disc about the origin after displacing the disc by (side, up)."""
     centre = tool.vector(0.0, tool.scene.height + 0.8)
-    tool.scene.place(lambda x: matrix @ x)
+    tool.scene.move_bottom(lambda x: matrix @ x)
     return matrix @ (centre + tool.vector(side, up)) - centre
 
 
@@ -78,17 +78,17 @@ def test_rotation_of_the_whole_scene_rotates_the_tractions(cell, shape, enforcem
     axis = np.array([0.6, 0.0, 0.8])
     contact = {"enforcement": enforcement, "tolerance": 1e-9}
     allowed = 1e-9 if enforcement == "penalty" else 1e-7
-    still, tool = (Tool(cell, contact=contact, shape=shape) for _ in range(2))
+    still, tool = (DiscOnRubber(cell, contact=contact, shape=shape) for _ in range(2))
     if d == 3:
         obstacle = disc(
             tool.scene, 0.8, displacement=tool.shift, angle=tool.angle, axis=axis, shape=shape
         )
         tool.problem, tool.contact = tool.scene.problem(
-            obstacle, fc.Coulomb(0.3, 1e4, 1e4), contact=contact, petsc_options=TIGHT
+            obstacle, fc.Coulomb(0.3, 1e4, 1e4), contact=contact, petsc_options=TIGHT_TOLERANCE
         )
     for side, up in PATH[:4]:
-        still.go(side, up)
-        tool.go(side, up)
+        still.solve_increment(side, up)
+        tool.solve_increment(side, up)
     before = still.tractions()
     for angle, (side, up) in [*((a, PATH[3]) for a in (0.3, 0.6, 0.9, 1.2)), (1.2, PATH[4])]:
         c, s = np.cos(angle), np.sin(angle)
@@ -102,9 +102,9 @@ def test_rotation_of_the_whole_scene_rotates_the_tractions(cell, shape, enforcem
         tool.problem.solve()
         tool.problem.commit()
         if (side, up) == PATH[4]:
-            still.go(side, up)
+            still.solve_increment(side, up)
             before = still.tractions()
-        assert close(tool.tractions(), before @ matrix.T, allowed)
+        assert is_close(tool.tractions(), before @ matrix.T, allowed)
 
 
 @pytest.mark.parametrize("law", [fc.Frictionless(1e4), fc.Coulomb(0.2, 1e4, 1e4)])
@@ -118,13 +118,13 @@ def test_small_and_finite_agree_to_first_order(law):
     for size in (4e-3, 1e-3):
         found = []
         for kinematics in ("finite", "small"):
-            scene = rubber("triangle", n=(12, 6), linear=True, bend=domed)
+            scene = rubber("triangle", n=(12, 6), linear=True, bend=bend_top)
             shift = fem.Constant(scene.mesh, np.zeros(2))
             problem, contact = scene.problem(
                 fc.Ball((0, -1), 2.0, inside=True, displacement=shift),
                 law,
                 contact={"kinematics": kinematics},
-                petsc_options=TIGHT,
+                petsc_options=TIGHT_TOLERANCE,
                 small_displacement_tolerance=np.inf,
             )
             for side, up in ((0.0, -1.0), (0.5, -1.5)):
@@ -143,13 +143,13 @@ def test_frictionless_loop_does_no_work():
     Its work in 48 increments, by the mean of the forces at both ends of each, is at most 1e-3 of
     the largest work on the path. Without friction there is no history: the last force is 0.
     """
-    tool = Tool(law=fc.Frictionless(1e4), n=(8, 4))
+    tool = DiscOnRubber(law=fc.Frictionless(1e4), n=(8, 4))
     corners = [(0, 0, 0), (0, -0.15, 0), (0.2, -0.15, 1), (0.2, 0, 1)]
     work, peak = 0.0, 0.0
     for start, end in pairwise(corners):
         for share in np.arange(1, 17) / 16:
             side, up, angle = (1 - share) * np.array(start) + share * np.array(end)
-            step = tool.go(side, up, angle)
+            step = tool.solve_increment(side, up, angle)
             work += step.energy.work
             peak = max(peak, work)
     assert peak > 1.0
@@ -166,19 +166,19 @@ def test_rolling_disc_has_less_friction_than_a_sliding_one():
     radius, push = 0.8, -0.1
     forces = {}
     for name, rate in {"slides": 0.0, "rolls": -1.0 / radius}.items():
-        tool = Tool(radius=radius, law=fc.Coulomb(0.3, 1e4, 1e4))
-        tool.go(0.0, push)
+        tool = DiscOnRubber(radius=radius, law=fc.Coulomb(0.3, 1e4, 1e4))
+        tool.solve_increment(0.0, push)
         for side in np.arange(1, 9) * 0.3 / 8:
-            step = tool.go(side, push, rate * side)
+            step = tool.solve_increment(side, push, rate * side)
             assert step.energy.dissipation >= -1e-12
         forces[name] = tool.resultant()
     normal = -forces["slides"][1]
     assert forces["slides"][0] == pytest.approx(0.3 * normal, rel=0.1)
     assert abs(forces["rolls"][0]) < forces["slides"][0] / 3
-    tool = Tool(radius=radius, law=fc.Coulomb(0.3, 1e4, 1e4))
-    tool.go(0.0, push)
+    tool = DiscOnRubber(radius=radius, law=fc.Coulomb(0.3, 1e4, 1e4))
+    tool.solve_increment(0.0, push)
     for angle in np.arange(1, 9) * 0.05:
-        tool.go(0.0, push, angle)
+        tool.solve_increment(0.0, push, angle)
     assert tool.resultant()[0] == pytest.approx(0.3 * -tool.resultant()[1], rel=0.1)
 
 
@@ -189,14 +189,14 @@ def test_friction_moment_of_a_full_turn():
     after half a turn and a full turn agree to 1e-9.
     """
     radius, friction = 0.8, 0.3
-    tool = Tool(radius=radius, law=fc.Coulomb(friction, 1e4, 1e4))
+    tool = DiscOnRubber(radius=radius, law=fc.Coulomb(friction, 1e4, 1e4))
     for push in (-0.05, -0.1):
-        tool.go(0.0, push)
+        tool.solve_increment(0.0, push)
     forces = []
     for k in range(1, 13):
-        tool.go(0.0, push, k * np.pi / 6)
+        tool.solve_increment(0.0, push, k * np.pi / 6)
         forces.append(tool.resultant())
-    assert close(forces[-1], forces[5], 1e-9)
+    assert is_close(forces[-1], forces[5], 1e-9)
     contact = tool.contact
     arm = contact.measure * (radius - contact.values.penetration)
     expected = COMM.allreduce(friction * float(arm @ contact.pressure))
@@ -210,16 +210,16 @@ def test_no_solution_has_inverted_cells():
 
     The state with J < 0 has a force of 2397; smaller increments lead to 86.8.
     """
-    tool = Tool(n=(16, 8), law=fc.Coulomb(0.3))
+    tool = DiscOnRubber(n=(16, 8), law=fc.Coulomb(0.3))
     tool.problem, tool.contact = tool.scene.problem(
         disc(tool.scene, 0.8, displacement=tool.shift),
         fc.Coulomb(0.3),
         method="newton",
         petsc_options={"snes_linesearch_type": "basic"},
     )
-    tool.go(0.0, -0.05)
+    tool.solve_increment(0.0, -0.05)
     try:
-        tool.go(0.0, -0.1)
+        tool.solve_increment(0.0, -0.1)
     except fc.NotConverged:
         return
     volume = ufl.det(ufl.Identity(2) + ufl.grad(tool.scene.u))
@@ -233,17 +233,17 @@ def test_newton_converges_quadratically():
     Asserted is an order of convergence above 1.7 for the last two residuals relative to the first,
     and fewer than 8 residuals in all.
     """
-    tool = Tool(law=fc.Frictionless(1e4))
+    tool = DiscOnRubber(law=fc.Frictionless(1e4))
     tool.problem, tool.contact = tool.scene.problem(
         disc(tool.scene, 0.8, displacement=tool.shift),
         fc.Frictionless(1e4),
         method="newton",
         petsc_options={"snes_rtol": 1e-10},
     )
-    tool.go(0.0, -0.1)
+    tool.solve_increment(0.0, -0.1)
     norms = []
     tool.problem.snes.setMonitor(lambda snes, i, norm: norms.append(norm))
-    tool.go(0.0, -0.11)
+    tool.solve_increment(0.0, -0.11)
     norms = [norm for norm in norms if norm > 0]  # zero may be reached exactly
     shares = np.log10(np.array(norms[-3:]) / norms[0])
     assert shares[2] < 1.7 * shares[1]
@@ -256,14 +256,16 @@ def test_area_and_moment_of_a_rotated_and_stretched_body():
     Reference: sum over the points in numpy of the moments of forces at 1.25 R X, to 1e-12.
     """
     for cell in ("triangle", "tetrahedron"):
-        tool = Tool(cell, n=(4, 2))
+        tool = DiscOnRubber(cell, n=(4, 2))
         d = tool.scene.dim
         c, s = np.cos(0.7), np.sin(0.7)
         turn = np.eye(d)
         turn[:2, :2] = [[c, -s], [s, c]]
         tool.scene.u.interpolate(lambda x, d=d, turn=turn: 1.25 * turn @ x[:d] - x[:d])
         contact = tool.contact
-        assert close(contact.area_stretch(), np.full(len(contact.points), 1.25 ** (d - 1)), 1e-12)
+        assert is_close(
+            contact.area_stretch(), np.full(len(contact.points), 1.25 ** (d - 1)), 1e-12
+        )
         # The tool follows the stretched block and penetrates it.
         tool.shift.value[:] = 1.95 * turn @ tool.vector(0.0, 1.0) - tool.vector(0.1, 1.8)
         contact.evaluate()
@@ -276,4 +278,4 @@ def test_area_and_moment_of_a_rotated_and_stretched_body():
             expected = np.atleast_1d((arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]).sum())
         expected = COMM.allreduce(expected)
         assert np.abs(expected).max() > 1.0
-        assert close(contact.moment(about), expected, 1e-12)
+        assert is_close(contact.moment(about), expected, 1e-12)

@@ -9,9 +9,9 @@ from dolfinx import fem
 
 import fenics_contact as fc
 from fenics_contact.elasticity import NeoHookean
-from scenes import rubbed
+from scenes import sliding_rubber_block
 from scenes.blocks import BOTTOM, LEFT, TOP, block_mesh
-from scenes.elasticity import displacement_space, hold
+from scenes.elasticity import dirichlet_bc, displacement_space
 from verification.extreme_finite import rotated_together
 
 pytestmark = pytest.mark.two_ranks
@@ -104,7 +104,11 @@ def test_rubber_block_under_a_disc(cross_check):
     mesh, tags = block_mesh("quadrilateral", n=(10, 20), size=(5.0, 10.0))
     u = fem.Function(displacement_space(mesh, 2))
     body = NeoHookean(u, 1000.0, 0.3, "plane strain")
-    bcs = [hold(u, tags, BOTTOM, 0), hold(u, tags, BOTTOM, 1), hold(u, tags, LEFT, 0)]
+    bcs = [
+        dirichlet_bc(u, tags, BOTTOM, 0),
+        dirichlet_bc(u, tags, BOTTOM, 1),
+        dirichlet_bc(u, tags, LEFT, 0),
+    ]
     shift = fem.Constant(mesh, np.zeros(2))
     disc = fc.Ball((0.0, 14.0), 4.0, displacement=shift)
     surface = fc.ContactSurface(mesh, tags, TOP)
@@ -134,7 +138,7 @@ def test_rubber_block_pressed_turned_and_dragged():
     mesh.geometry.x[:, 0] -= 8
     u = fem.Function(displacement_space(mesh, 2))
     body = NeoHookean(u, 1000.0, 0.3, "plane strain")
-    bcs = [hold(u, tags, BOTTOM, 0), hold(u, tags, BOTTOM, 1)]
+    bcs = [dirichlet_bc(u, tags, BOTTOM, 0), dirichlet_bc(u, tags, BOTTOM, 1)]
     shift, angle = fem.Constant(mesh, np.zeros(2)), fem.Constant(mesh, 0.0)
     turn = fc.Rotation(angle, about=(0.0, 14.0))
     disc = fc.Ball((0.0, 14.0), 4.0, displacement=shift, rotation=turn)
@@ -170,7 +174,7 @@ def test_rubber_block_dragged_over_another(friction):
     with multipliers linear along the side, has forces of 137.7 and 40.35 at the end, 3.5 % more:
     nothing penetrates, here by up to 4 % of the depth.
     """
-    made = rubbed.Rubbed(friction)
+    made = sliding_rubber_block.SlidingRubberBlock(friction)
     problem = fc.ContactProblem(
         made.residual,
         made.u,
@@ -179,8 +183,8 @@ def test_rubber_block_dragged_over_another(friction):
         petsc_options={"snes_rtol": 1e-11},
     )
     iterations, size = 0, 135.0
-    for place, expected in zip(rubbed.PATH, GETFEM_TWO[friction], strict=False):
-        made.lead(*place)
+    for place, expected in zip(sliding_rubber_block.PATH, GETFEM_TWO[friction], strict=False):
+        made.set_top_displacement(*place)
         iterations += problem.solve().iterations
         problem.commit()
         found = made.contact.resultants().force

@@ -11,49 +11,51 @@ from petsc4py import PETSc
 
 import fenics_contact as fc
 from fenics_contact import checkpoint
-from scenes.comparing import close, raised_everywhere, shared_folder
-from scenes.histories import goes_on
-from scenes.rubber import Tool, rubber
+from scenes.comparison import assert_raised_on_all_ranks, is_close, shared_folder
+from scenes.histories import assert_restart_equals_uninterrupted
+from scenes.rubber import DiscOnRubber, rubber
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(300)]
 
-HOW = {
+VARIANTS = {
     "penalty": {},
     "augmented": {"contact": {"enforcement": "augmented"}},
-    "by force": {"force": True},
+    "by force": {"by_force": True},
     "linear": {"linear": True, "solver": {"small_displacement_tolerance": np.inf}},
     "frictionless": {"law": fc.Frictionless(1e4)},
     "profile": {"shape": "profile"},
-    "facets": {"shape": "facets", "force": True},
+    "facets": {"shape": "facets", "by_force": True},
 }
 
 
-@pytest.mark.parametrize("how", HOW)
+@pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_restart(cell, how, tmp_path):
+def test_restart(cell, variant, tmp_path):
     """A history restarted while the tool rotates has the same digits on one rank, 1e-7 on more."""
     options = {"n": (8, 4)} if cell == "triangle" else {}
-    goes_on(lambda: Tool(cell, **options, **HOW[how]), shared_folder(tmp_path), stop=5)
+    assert_restart_equals_uninterrupted(
+        lambda: DiscOnRubber(cell, **options, **VARIANTS[variant]), shared_folder(tmp_path), stop=5
+    )
 
 
 def test_checkpoint_of_other_kinematics_or_angle_is_refused(tmp_path):
     """A restart with small displacements, or with another angle of the tool, is refused."""
     path = shared_folder(tmp_path) / "state.npz"
     law = fc.Frictionless(1e4)
-    tool = Tool(n=(4, 2), law=law)
-    tool.go(0.0, -0.05, 0.3)
+    tool = DiscOnRubber(n=(4, 2), law=law)
+    tool.solve_increment(0.0, -0.05, 0.3)
     checkpoint.save(tool.problem, path)
-    other = Tool(n=(4, 2), law=law)
+    other = DiscOnRubber(n=(4, 2), law=law)
     other.shift.value[:], other.angle.value = tool.shift.value, 0.3
     checkpoint.load(other.problem, path)
-    other = Tool(n=(4, 2), law=law)
+    other = DiscOnRubber(n=(4, 2), law=law)
     other.shift.value[:] = tool.shift.value
-    raised_everywhere(lambda: checkpoint.load(other.problem, path), ValueError, "turn")
+    assert_raised_on_all_ranks(lambda: checkpoint.load(other.problem, path), ValueError, "turn")
     scene = rubber(n=(4, 2))
     problem, _ = scene.problem(
         fc.Ball((0, 1.8), 0.8, displacement=(0, -0.05)), law, contact={"kinematics": "small"}
     )
-    raised_everywhere(lambda: checkpoint.load(problem, path), ValueError, "kinematics")
+    assert_raised_on_all_ranks(lambda: checkpoint.load(problem, path), ValueError, "kinematics")
 
 
 @pytest.mark.parametrize("shape", ["ball", "profile"])
@@ -64,7 +66,7 @@ def test_first_touch_across_a_large_gap_with_cut_increments(shape):
     """
     ends = []
     for steps in (1, 20):
-        tool = Tool(n=(16, 8), law=fc.Frictionless(1e4), shape=shape)
+        tool = DiscOnRubber(n=(16, 8), law=fc.Frictionless(1e4), shape=shape)
 
         def load(t, tool=tool):
             tool.shift.value[:] = tool.vector(0.1, 0.5 - 0.7 * t)
@@ -72,13 +74,13 @@ def test_first_touch_across_a_large_gap_with_cut_increments(shape):
         *_, _ = fc.increments(tool.problem, load, 0.0, 1.0, steps=steps)
         ends.append(tool.tractions())
     assert np.abs(ends[1]).max() > 100.0
-    assert close(ends[0], ends[1], 1e-7)
+    assert is_close(ends[0], ends[1], 1e-7)
 
 
 def test_free_obstacle_is_in_equilibrium_with_its_force():
     """N is the force on the tool at any angle, to 1e-8, and the body follows the tool."""
     for cell in ("triangle", "tetrahedron"):
-        tool = Tool(cell, force=True, **({"n": (8, 4)} if cell == "triangle" else {}))
+        tool = DiscOnRubber(cell, by_force=True, **({"n": (8, 4)} if cell == "triangle" else {}))
         for step in tool.increments(2.0):
             r = step.contacts["contact"]
             assert r.force[-1] == pytest.approx(tool.down.value, rel=1e-8)
@@ -87,7 +89,7 @@ def test_free_obstacle_is_in_equilibrium_with_its_force():
 
 def test_finite_kinematics_have_no_small_displacement_error():
     """The error budget's part "kinematics" is 0, to round-off, and so is the verdict's error."""
-    tool = Tool(n=(8, 4))
+    tool = DiscOnRubber(n=(8, 4))
     for step in tool.increments(2.0):
         assert all(k.worst == 0.0 for k in step.verdict.small_displacement_error.values())
     body = tool.scene.body
@@ -130,7 +132,7 @@ def test_form_in_a_user_defined_problem(shape):
     The body is hyperelastic, with friction, in two increments; the residual is F + contact.form(v).
     An obstacle from data is sampled by `Contact.evaluate` whenever u has changed.
     """
-    own, reference = (Tool("triangle", n=(8, 4), shape=shape) for _ in range(2))
+    own, reference = (DiscOnRubber("triangle", n=(8, 4), shape=shape) for _ in range(2))
     scene, contact = own.scene, own.contact
     space = scene.u.function_space
     v, du = ufl.TestFunction(space), ufl.TrialFunction(space)
@@ -160,6 +162,6 @@ def test_form_in_a_user_defined_problem(shape):
             if step.norm() < 1e-13:
                 break
         contact.commit()
-        reference.go(side, up)
+        reference.solve_increment(side, up)
     assert np.abs(reference.resultant()[0]) > 0.1
-    assert close(own.tractions(), reference.tractions(), 1e-9)
+    assert is_close(own.tractions(), reference.tractions(), 1e-9)

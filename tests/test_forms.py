@@ -16,8 +16,8 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic, NeoHookean
 from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block_mesh
-from scenes.comparing import at_points, close, nodal, raised_everywhere
-from scenes.elasticity import displacement_space, hold, strain, stress
+from scenes.comparison import assert_raised_on_all_ranks, is_close, nodal_values, point_values
+from scenes.elasticity import dirichlet_bc, displacement_space, strain, stress
 
 pytestmark = [
     pytest.mark.newest,
@@ -88,7 +88,7 @@ class Layers:
     def solved(self, F, law=None, **options):
         """Solve; return the displacements at the nodes, and k_n at the points of Γc."""
         if self.w is self.u:
-            bcs = [hold(self.u, self.facets, LEFT, 0)]
+            bcs = [dirichlet_bc(self.u, self.facets, LEFT, 0)]
         else:
             part = self.w.function_space.sub(self.part).sub(0)
             dofs = fem.locate_dofs_topological(part, 1, self.facets.find(LEFT))
@@ -100,7 +100,9 @@ class Layers:
             F, self.w, bcs=bcs, contacts=[contact], petsc_options=TIGHT, **options
         )
         problem.solve()
-        return nodal(problem.displacement.u), at_points(contact, contact.values.parameters["k_n"])
+        return nodal_values(problem.displacement.u), point_values(
+            contact, contact.values.parameters["k_n"]
+        )
 
 
 def two_measures_with_one_data(s):
@@ -135,7 +137,7 @@ def two_materials(s, dx=None):
 
 
 # Forms as they occur in scripts, by name.
-WAYS = {
+EQUIVALENT_FORMS = {
     "two materials": lambda s: two_materials(s) - s.loads(s.dx(UPPER), s.ds(TOP)),
     "without a mesh": lambda s: (
         two_materials(s, ufl.Measure("dx", subdomain_data=s.cells))
@@ -178,16 +180,16 @@ WAYS = {
 
 
 @pytest.mark.whole
-@pytest.mark.parametrize("way", WAYS)
-def test_equivalent_forms_have_the_same_solution(way):
+@pytest.mark.parametrize("form", EQUIVALENT_FORMS)
+def test_equivalent_forms_have_the_same_solution(form):
     """Every form has the solution and k_n of that with coefficients by cell, to 1e-9."""
     s = Layers()
-    u, k_n = s.solved(WAYS[way](s))
+    u, k_n = s.solved(EQUIVALENT_FORMS[form](s))
     reference = Layers()
     expected, stiffness = reference.solved(reference.plain())
-    assert close(u, expected, 1e-9) and close(k_n, stiffness, 1e-9)
+    assert is_close(u, expected, 1e-9) and is_close(k_n, stiffness, 1e-9)
     # E of the lower layer, on cells of height 1/4; to the round-off of its smoothing.
-    assert close(k_n, np.full(k_n.shape, 10 * E[LOWER] * 4), 1e-9)
+    assert is_close(k_n, np.full(k_n.shape, 10 * E[LOWER] * 4), 1e-9)
 
 
 VECTOR, SCALAR = (
@@ -217,8 +219,8 @@ def test_two_materials_in_a_mixed_form(parts):
             F = work(s.E) * ufl.dx - s.pull * s.v[0] * ufl.dx + s.pressure * s.v[1] * s.ds(TOP)
         found.append(s.solved(F))
     (u, k_n), (expected, stiffness) = found
-    assert close(u, expected, 1e-9) and close(k_n, stiffness, 1e-9)
-    assert close(k_n, np.full(k_n.shape, 10 * 3 * E[LOWER] / (2 * (1 + NU)) * 4), 1e-9)
+    assert is_close(u, expected, 1e-9) and is_close(k_n, stiffness, 1e-9)
+    assert is_close(k_n, np.full(k_n.shape, 10 * 3 * E[LOWER] / (2 * (1 + NU)) * 4), 1e-9)
 
 
 def test_two_nonlinear_materials():
@@ -242,7 +244,7 @@ def test_two_nonlinear_materials():
         s.pressure.value = 50.0
         found.append(s.solved(F))
     (u, k_n), (expected, stiffness) = found
-    assert close(u, expected, 1e-9) and close(k_n, stiffness, 1e-9)
+    assert is_close(u, expected, 1e-9) and is_close(k_n, stiffness, 1e-9)
 
 
 @pytest.mark.parametrize("kind", ["cells", "facets"])
@@ -268,7 +270,7 @@ def test_two_quadrature_rules_over_the_same_tags(kind):
             F += bed * s.ds((LEFT, RIGHT)) + s.v[0] * s.ds((LEFT, RIGHT))
         found.append(s.solved(F))
     (u, k_n), (expected, stiffness) = found
-    assert close(u, expected, 1e-9) and close(k_n, stiffness, 1e-9)
+    assert is_close(u, expected, 1e-9) and is_close(k_n, stiffness, 1e-9)
 
 
 def test_joined_bodies():
@@ -298,15 +300,15 @@ def test_joined_bodies():
         else:
             F = LinearElastic(u, joined.by_body(moduli), NU, "plane strain").residual(v)
         F += fem.Constant(mesh, 2.0) * v[1] * ds(joined.facet("upper", TOP))
-        bcs = [hold(u, joined.facets, joined.facet("lower", BOTTOM), i) for i in range(2)]
-        bcs.append(hold(u, joined.facets, joined.facet("upper", LEFT), 0))
+        bcs = [dirichlet_bc(u, joined.facets, joined.facet("lower", BOTTOM), i) for i in range(2)]
+        bcs.append(dirichlet_bc(u, joined.facets, joined.facet("upper", LEFT), 0))
         surface = fc.ContactSurface(mesh, joined.facets, joined.facet("upper", BOTTOM))
         below = fc.DeformableBody(joined.facets, joined.facet("lower", TOP))
         contact = fc.Contact(u, surface, below, fc.Coulomb(0.3))
         fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], petsc_options=TIGHT).solve()
-        found.append((nodal(u), at_points(contact, contact.values.parameters["k_n"])))
+        found.append((nodal_values(u), point_values(contact, contact.values.parameters["k_n"])))
     (u, k_n), (expected, stiffness) = found
-    assert close(u, expected, 1e-9) and close(k_n, stiffness, 1e-9)
+    assert is_close(u, expected, 1e-9) and is_close(k_n, stiffness, 1e-9)
 
 
 def test_interior_facets_with_tagged_cells():
@@ -315,10 +317,10 @@ def test_interior_facets_with_tagged_cells():
     for tagged in (True, False):
         s = Layers(ghost_mode=dolfinx.mesh.GhostMode.shared_facet)
         jumps = ufl.inner(ufl.jump(ufl.grad(s.u)), ufl.jump(ufl.grad(s.v))) * ufl.dS(s.mesh)
-        F = WAYS["two materials"](s) if tagged else s.plain()
+        F = EQUIVALENT_FORMS["two materials"](s) if tagged else s.plain()
         found.append(s.solved(F + fem.Constant(s.mesh, 10.0) * jumps))
     (u, k_n), (expected, stiffness) = found
-    assert close(u, expected, 1e-9) and close(k_n, stiffness, 1e-9)
+    assert is_close(u, expected, 1e-9) and is_close(k_n, stiffness, 1e-9)
 
 
 @pytest.mark.parametrize("kind", ["dx", "ds"])
@@ -330,23 +332,29 @@ def test_two_tag_objects_for_one_kind_of_measure_are_refused(kind):
     F = s.plain()
     for data in (tags, copy):
         F += s.v[0] * ufl.Measure(kind, s.mesh, subdomain_data=data)(UPPER)
-    raised_everywhere(lambda: s.solved(F), ValueError, f"integrals over {kind} with two different")
+    assert_raised_on_all_ranks(
+        lambda: s.solved(F), ValueError, f"integrals over {kind} with two different"
+    )
 
 
 def test_tags_of_other_entities_or_meshes_are_refused():
     """Facet tags for cells, or tags of another mesh, are named; DOLFINx gives a code or nothing."""
     s, other = Layers(), Layers()
     F = s.plain() + s.v[0] * ufl.Measure("dx", s.mesh, subdomain_data=s.facets)(TOP)
-    raised_everywhere(lambda: s.solved(F), ValueError, f"dx({TOP})", "dimension 1", "on the cells")
+    assert_raised_on_all_ranks(
+        lambda: s.solved(F), ValueError, f"dx({TOP})", "dimension 1", "on the cells"
+    )
     F = s.plain() + s.v[0] * ufl.Measure("dx", s.mesh, subdomain_data=other.cells)(UPPER)
-    raised_everywhere(lambda: s.solved(F), ValueError, f"dx({UPPER})", "another mesh")
+    assert_raised_on_all_ranks(lambda: s.solved(F), ValueError, f"dx({UPPER})", "another mesh")
 
 
 def test_subdomain_of_a_measure_without_tags_is_refused():
     """An integral over a subdomain without tags is named, even if other measures have tags."""
     s = Layers()
-    F = WAYS["two materials"](s) + s.v[0] * ufl.dx(s.mesh)(UPPER)
-    raised_everywhere(lambda: s.solved(F), ValueError, f"an integral over dx({UPPER})", "no tags")
+    F = EQUIVALENT_FORMS["two materials"](s) + s.v[0] * ufl.dx(s.mesh)(UPPER)
+    assert_raised_on_all_ranks(
+        lambda: s.solved(F), ValueError, f"an integral over dx({UPPER})", "no tags"
+    )
 
 
 # ---- in time -------------------------------------------------------------------------------------
@@ -394,9 +402,9 @@ def test_inertia_is_not_counted_as_stiffness(kind):
             u, surface, floor, fc.Coulomb(0.3, fc.RelativeStiffness(5.0)), weight=weight
         )
         fc.ContactProblem(F, u, contacts=[contact])
-        found.append(at_points(contact, contact.values.parameters["k_n"]))
+        found.append(point_values(contact, contact.values.parameters["k_n"]))
     # The height of a cell is half of that of the block.
-    assert close(found, np.full_like(found, 5.0 * E[LOWER] * 2), 1e-9)
+    assert is_close(found, np.full_like(found, 5.0 * E[LOWER] * 2), 1e-9)
 
 
 def test_inertia_in_a_mixed_form():
@@ -407,4 +415,4 @@ def test_inertia_in_a_mixed_form():
     F += DENSITY * ufl.dot(newmark(s.u, s.v, dt)[0], s.v) * ufl.dx
     F -= s.q * (ufl.div(s.u) + s.p / E[LOWER]) * ufl.dx - s.pressure * s.v[1] * s.ds(TOP)
     _, k_n = s.solved(F)
-    assert close(k_n, np.full(k_n.shape, 10 * 3 * G * 4), 1e-9)
+    assert is_close(k_n, np.full(k_n.shape, 10 * 3 * G * 4), 1e-9)

@@ -13,9 +13,9 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.laws.return_maps import norm
-from scenes.blocks import block, wave
-from scenes.comparing import close, gathered, raised_everywhere
-from scenes.laws import Saturating
+from scenes.blocks import block, rough_field
+from scenes.comparison import assert_raised_on_all_ranks, gather, is_close
+from scenes.user_laws import SaturatingFriction
 
 COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
@@ -76,7 +76,7 @@ def test_load_above_the_limit_with_cohesion_is_an_overload():
     """The error states the friction limit, 1.3, although the friction bound is not μ p."""
     law = Cohesive(MU, k_n=1e5, k_t=1e5, cohesion=COHESION)
     problem, _ = low_block(law, 1.35)
-    raised_everywhere(problem.solve, fc.NotConverged, "overload", "at most 1.3")
+    assert_raised_on_all_ranks(problem.solve, fc.NotConverged, "overload", "at most 1.3")
 
 
 K = {"k_n": 1e5, "k_t": 1e5}
@@ -94,7 +94,7 @@ RATIOS = {
     "no cohesion": (Cohesive(MU, **K), MU),
     "cohesion": (Cohesive(MU, **K, cohesion=1.0), np.inf),
     "motion": (Strengthening(MU, **K, rate=RATE), np.inf),
-    "saturating": (Saturating(MU, 4.0, 1e5, 1e5), np.inf),
+    "saturating": (SaturatingFriction(MU, 4.0, 1e5, 1e5), np.inf),
 }
 
 
@@ -109,7 +109,7 @@ def test_friction_bound_ratio_follows_from_the_friction_bound(name):
     contact = block("hexahedron", n=1).contact(law)
     contact.evaluate()
     ratio = contact.values.friction_bound_ratio
-    assert np.array_equal(ratio, np.full_like(ratio, expected)) or close(
+    assert np.array_equal(ratio, np.full_like(ratio, expected)) or is_close(
         ratio, np.full_like(ratio, expected), 1e-14
     )
 
@@ -164,8 +164,8 @@ def test_friction_coefficient_that_grows_with_the_slip_distance(cell, method):
     for _ in range(2):
         step = problem.solve()
         assert step.verdict.failures == [] and step.contacts["contact"].stick == 0
-        moved = gathered(COMM, contact.values.increment)[:, 0]
-        assert close(moved, np.full_like(moved, (0.4 - MU) / RATE), 1e-4)
+        moved = gather(COMM, contact.values.increment)[:, 0]
+        assert is_close(moved, np.full_like(moved, (0.4 - MU) / RATE), 1e-4)
         problem.commit()
 
 
@@ -182,7 +182,7 @@ def test_tangent_includes_the_derivative_by_the_slip_distance(cell, kinematics):
         scene.u.interpolate(
             lambda x: (
                 np.stack([0.05 + 0.02 * x[0]] * (d - 1) + [-0.01 - 0.01 * x[0]])
-                + step * wave(d, 3)(x)
+                + step * rough_field(d, 3)(x)
             )
         )
         return contact.effective_law.traction().copy()
@@ -194,8 +194,8 @@ def test_tangent_includes_the_derivative_by_the_slip_distance(cell, kinematics):
     assert np.all(contact.status == 2)  # slip
     by_jump = contact.effective_law.tangent().by_jump
     jump = fem.Function(scene.u.function_space)
-    jump.interpolate(wave(d, 3))
+    jump.interpolate(rough_field(d, 3))
     scene.u.x.array[:] = jump.x.array
     direction = contact.contact_kinematics.present_jump()
     exact = np.einsum("qij,qj->qi", by_jump, direction)
-    assert close(gathered(COMM, change), gathered(COMM, exact), 1e-6)
+    assert is_close(gather(COMM, change), gather(COMM, exact), 1e-6)

@@ -11,16 +11,16 @@ from dolfinx import fem, io
 from mpi4py import MPI
 
 import fenics_contact as fc
+from scenes.block_on_ball import BlockOnBall
 from scenes.blocks import BOTTOM, CELLS, block
-from scenes.comparing import (
-    assemble_number,
-    close,
-    compiled,
-    gathered,
-    raised_everywhere,
+from scenes.comparison import (
+    assemble_scalar,
+    assert_raised_on_all_ranks,
+    compile_with_maps,
+    gather,
+    is_close,
     shared_folder,
 )
-from scenes.rubbing import Rub
 
 COMM = MPI.COMM_WORLD
 
@@ -30,7 +30,7 @@ pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 @pytest.mark.parametrize("cell", CELLS)
 def test_integrals_equal_sums_over_quadrature_points(cell):
     """Forms on the body's mesh have facets of all orientations; nodal values remain in range."""
-    made = Rub(cell=cell, degree=2, mesh={"n": 4, "shuffled": True})
+    made = BlockOnBall(cell=cell, degree=2, mesh={"n": 4, "shuffled": True})
     made.problem.small_displacement_tolerance = np.inf
     list(fc.increments(made.problem, made.load, 0, 2, steps=2))
     contact, d = made.contact, made.scene.dim
@@ -47,32 +47,32 @@ def test_integrals_equal_sums_over_quadrature_points(cell):
         n = 1 if values.ndim == 1 else d
         rows = values.reshape(-1, n)
         parts = [found] if values.ndim == 1 else [found[i] for i in range(d)]
-        sums = [assemble_number(compiled(part * ds, contact), COMM) for part in parts]
+        sums = [assemble_scalar(compile_with_maps(part * ds, contact), COMM) for part in parts]
         expected = COMM.allreduce(contact.measure @ rows)
         size = COMM.allreduce(contact.measure @ np.abs(rows))
-        assert close(sums, expected, 1e-12, scale=size.max()), name
-        everywhere = gathered(COMM, rows)
+        assert is_close(sums, expected, 1e-12, scale=size.max()), name
+        everywhere = gather(COMM, rows)
         low, high = everywhere.min(axis=0), everywhere.max(axis=0)
         nodal = found.x.array.reshape(-1, n)
         assert COMM.allreduce(int(np.any((nodal < low) | (nodal > high)))) == 0, name
     force = contact.resultants().normal_force
     pressure = contact.function("pressure")
-    assert close(assemble_number(compiled(pressure * ds, contact), COMM), force, 1e-12)
+    assert is_close(assemble_scalar(compile_with_maps(pressure * ds, contact), COMM), force, 1e-12)
 
 
 def test_compiled_form_takes_updated_values():
     """A function in a form that is compiled once takes the values of the next state (1e-12)."""
-    made = Rub(mesh={"n": 4})
+    made = BlockOnBall(mesh={"n": 4})
     made.problem.small_displacement_tolerance = np.inf
     contact = made.contact
     ds = ufl.ds(made.scene.mesh, subdomain_data=made.scene.tags)(BOTTOM)
     pressure, slip = contact.function("pressure"), contact.function("slip")
-    form = compiled(pressure * ds, contact)
-    assert assemble_number(form, COMM) == 0.0
+    form = compile_with_maps(pressure * ds, contact)
+    assert assemble_scalar(form, COMM) == 0.0
     for _ in fc.increments(made.problem, made.load, 0, 2, steps=4):
         assert contact.function("pressure", pressure) is pressure
         contact.function("slip", into=slip)
-        assert close(assemble_number(form, COMM), contact.resultants().normal_force, 1e-12)
+        assert is_close(assemble_scalar(form, COMM), contact.resultants().normal_force, 1e-12)
     assert COMM.allreduce(np.max(slip.x.array, initial=0.0), op=MPI.MAX) > 0
 
 
@@ -94,9 +94,13 @@ def test_wrong_arguments_are_named():
     """Errors name the wrong argument on all ranks."""
     scene = block("triangle")
     contact = scene.contact(fc.Frictionless(1e3))
-    raised_everywhere(lambda: contact.function("heat"), ValueError, "'heat'", "'pressure'")
-    raised_everywhere(lambda: contact.function("gap", into=3), ValueError, "into is a int")
+    assert_raised_on_all_ranks(lambda: contact.function("heat"), ValueError, "'heat'", "'pressure'")
+    assert_raised_on_all_ranks(lambda: contact.function("gap", into=3), ValueError, "into is a int")
     vector = contact.function("normal")
-    raised_everywhere(lambda: contact.function("gap", into=vector), ValueError, "function('gap')")
+    assert_raised_on_all_ranks(
+        lambda: contact.function("gap", into=vector), ValueError, "function('gap')"
+    )
     other = fem.Function(fem.functionspace(scene.mesh, ("DG", 1)))
-    raised_everywhere(lambda: contact.function("gap", into=other), ValueError, "function('gap')")
+    assert_raised_on_all_ranks(
+        lambda: contact.function("gap", into=other), ValueError, "function('gap')"
+    )

@@ -14,7 +14,7 @@ import pytest
 from mpi4py import MPI
 
 from fenics_contact.checks.tunnelling import TunnellingCheck
-from scenes.processes import ROOT, environment
+from scenes.processes import ROOT, subprocess_environment
 from verification import (
     campaigns,
     finite_reference,
@@ -445,8 +445,8 @@ def test_gap_gradients_of_the_independent_solver(kind):
         assert np.allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-12)
         slope = np.zeros_like(x)
         for i in range(d):
-            way = 1e-6 * np.eye(d)[i]
-            slope[:, i] = (shape(x + way)[0] - shape(x - way)[0]) / 2e-6
+            step = 1e-6 * np.eye(d)[i]
+            slope[:, i] = (shape(x + step)[0] - shape(x - step)[0]) / 2e-6
         off = np.linalg.norm(slope + normal, axis=1)
         # The difference may involve two facets.
         assert np.sum(off > 1e-6) <= (2 if kind == "facets" else 0)
@@ -608,7 +608,7 @@ def test_campaign_can_be_resumed(tmp_path):
     def seeds(n):
         done = subprocess.run(
             [*base, "--scenes", str(n)],
-            env=environment(),
+            env=subprocess_environment(),
             capture_output=True,
             text=True,
             timeout=300,

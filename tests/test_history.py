@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.blocks import BOTTOM, CELLS, GRID, RIGHT, block, block_mesh, dimension, polynomial
-from scenes.comparing import close, gathered, same_field
+from scenes.comparison import gather, is_close, is_interpolant
 from scenes.elasticity import displacement_space
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
@@ -122,7 +122,7 @@ class Scene:
         )
         law = fc.Coulomb(FRICTION, k_n=K_N, k_t=K_T)
         self.contact = fc.Contact(self.u, surface, obstacle, law)
-        self.x = gathered(COMM, self.contact.points)
+        self.x = gather(COMM, self.contact.points)
 
     def reference(self) -> PointLaw:
         """Return the return map in numpy with this gap and normal, without history."""
@@ -160,26 +160,28 @@ def test_history_equals_the_return_map_in_numpy(cell, degree):
         u = field(scene.x.T).T
         expected = law.step(u, FRICTION, K_N, K_T)
         assert expected["margin"][0] > 1e-9, f"increment {number} is decided by rounding"
-        values = {name: gathered(COMM, v) for name, v in contact.values.arrays.items()}
+        values = {name: gather(COMM, v) for name, v in contact.values.arrays.items()}
         for name in ("opening", "penetration", "normal_traction", "traction", "slip_increment"):
             scale = {"opening": 0.1, "penetration": 0.1, "slip_increment": 0.1}.get(name, 1.0)
-            assert close(values[name], expected[name], EXACT, scale=scale), (number, name)
-        status = gathered(COMM, contact.status)
+            assert is_close(values[name], expected[name], EXACT, scale=scale), (number, name)
+        status = gather(COMM, contact.status)
         assert np.array_equal(status, expected["status"]), number
         assert wanted <= set(status.tolist()), number
         seen |= set(status.tolist())
         # The slip is unchanged before the commit.
-        assert close(gathered(COMM, contact.slip), law.beta, EXACT, scale=1.0), number
+        assert is_close(gather(COMM, contact.slip), law.beta, EXACT, scale=1.0), number
         contact.commit()
         law.commit(u, expected)
-        assert close(gathered(COMM, contact.slip), law.beta, EXACT, scale=1.0), number
+        assert is_close(gather(COMM, contact.slip), law.beta, EXACT, scale=1.0), number
         for name, value in (("traction", law.tau), ("jump", law.u)):
-            committed = gathered(COMM, contact.history.values(name))
-            assert close(committed, value, EXACT, scale=1.0), (number, name)
+            committed = gather(COMM, contact.history.values(name))
+            assert is_close(committed, value, EXACT, scale=1.0), (number, name)
         # The public results have the same values.
-        assert close(gathered(COMM, contact.pressure), -expected["normal_traction"], EXACT, scale=1)
+        assert is_close(
+            gather(COMM, contact.pressure), -expected["normal_traction"], EXACT, scale=1
+        )
         gap = expected["opening"] - expected["penetration"]
-        assert close(gathered(COMM, contact.gap), gap, EXACT, scale=0.1)
+        assert is_close(gather(COMM, contact.gap), gap, EXACT, scale=0.1)
     assert seen == {OPEN, STICK, SLIP}
     assert law.beta.min() > 0.1  # every mode of every point has slipped
 
@@ -195,11 +197,11 @@ def test_resultants_are_sums_over_the_points(cell):
         u = scene.displacement(number)(scene.x.T).T
         expected = law.step(u, FRICTION, K_N, K_T)
         contact.evaluate()
-        w = gathered(COMM, contact.quadrature.weights)
+        w = gather(COMM, contact.quadrature.weights)
         total = expected["normal_traction"][:, None] * law.normal + expected["traction"]
         closed = expected["status"] != OPEN
         for r in COMM.allgather(contact.resultants()):
-            assert close(r.force, w @ total, EXACT, scale=10.0)
+            assert is_close(r.force, w @ total, EXACT, scale=10.0)
             assert abs(r.normal_force + w @ expected["normal_traction"]) <= EXACT * 10
             size = np.linalg.norm(expected["traction"], axis=1)
             assert abs(r.tangential_force - w @ size) <= EXACT * 10
@@ -232,7 +234,7 @@ def test_gather_returns_all_points_in_order(cell):
         "status": contact.status,
         "measure": contact.measure,
     }
-    columns = {name: gathered(COMM, value) for name, value in columns.items()}
+    columns = {name: gather(COMM, value) for name, value in columns.items()}
     order = np.lexsort(np.round(columns["x"] / size, 9).T[::-1])
     for name, value in columns.items():
         assert np.array_equal(table[name], value[order]), name
@@ -277,12 +279,12 @@ def test_reopened_points_lose_their_traction(cell):
 
     def state() -> tuple[np.ndarray, np.ndarray]:
         """Return the traction along x and the accumulated slip of all modes at all points."""
-        tau = gathered(COMM, contact.history.values("traction"))
-        return tau[:, 0], gathered(COMM, contact.slip).sum(axis=1)
+        tau = gather(COMM, contact.history.values("traction"))
+        return tau[:, 0], gather(COMM, contact.slip).sum(axis=1)
 
     def expect(tau: float, slip: float) -> None:
         for actual, value in zip(state(), (tau, slip), strict=True):
-            assert close(actual, np.full(actual.shape, value), EXACT, scale=1.0)
+            assert is_close(actual, np.full(actual.shape, value), EXACT, scale=1.0)
 
     move(0.0, 0.15)
     expect(0.0, 0.0)
@@ -325,8 +327,8 @@ def test_history_of_a_moving_obstacle(cell):
         for contact in (moved, pushed):
             contact.commit()
         for name in ("gap", "traction", "slip"):
-            a, b = (gathered(COMM, getattr(c, name)) for c in (moved, pushed))
-            assert close(b, a, EXACT, scale=10.0), (name, side, down)
+            a, b = (gather(COMM, getattr(c, name)) for c in (moved, pushed))
+            assert is_close(b, a, EXACT, scale=10.0), (name, side, down)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -365,8 +367,8 @@ def test_contact_spring(cell, method):
         problem.solve()
         problem.commit()
         expected = scene.vector(side=u_t, up=u_n)
-        assert same_field(
+        assert is_interpolant(
             scene.u, lambda x, e=expected: np.outer(e, np.ones(x.shape[1])), 1e-6, scale=1.0
         ), (normal, tangential)
         if status is not None:
-            assert np.all(gathered(COMM, contact.status) == status), (normal, tangential)
+            assert np.all(gather(COMM, contact.status) == status), (normal, tangential)

@@ -14,12 +14,12 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.results import files
+from scenes.block_on_ball import BlockOnBall
 from scenes.blocks import TOP, block
-from scenes.comparing import close, raised_everywhere, shared_folder
+from scenes.comparison import assert_raised_on_all_ranks, is_close, shared_folder
 from scenes.elasticity import strain, stress
-from scenes.histories import Press
-from scenes.rubber import Tool
-from scenes.rubbing import Rub
+from scenes.histories import BlockOnBallHistory
+from scenes.rubber import DiscOnRubber
 
 COMM = MPI.COMM_WORLD
 
@@ -43,7 +43,7 @@ def numbers(rows, column):
 def test_every_row_contains_the_results_of_its_step(cell, tmp_path):
     """Each row equals its step, and is written before the step is yielded, in two calls."""
     path = shared_folder(tmp_path) / "history.csv"
-    made = Press(cell=cell, wall=True)
+    made = BlockOnBallHistory(cell=cell, wall=True)
     steps, moments = [], []
     for start, end in ((0.0, 2.0), (2.0, 3.0)):
         for step in made.increments(end, start, csv=path):
@@ -61,7 +61,7 @@ def test_every_row_contains_the_results_of_its_step(cell, tmp_path):
             assert numbers(rows, f"{name}: force {axis} (force{per})") == forces
         for i, axis in enumerate("xyz" if made.scene.dim == 3 else "z"):
             column = numbers(rows, f"{name}: moment {axis} about the origin (force length{per})")
-            assert close(column, [moment[name][i] for moment in moments], 1e-12)
+            assert is_close(column, [moment[name][i] for moment in moments], 1e-12)
         for column, attribute in (
             (f"normal force (force{per})", "normal_force"),
             (f"friction as the sum of sizes (force{per})", "tangential_force"),
@@ -98,7 +98,7 @@ def test_every_row_contains_the_results_of_its_step(cell, tmp_path):
 def test_restart_replaces_the_rows_after_the_checkpoint(tmp_path):
     """A restart replaces the rows after the checkpoint and does not change those before it."""
     folder = shared_folder(tmp_path)
-    whole, made, again = Press(), Press(), Press()
+    whole, made, again = BlockOnBallHistory(), BlockOnBallHistory(), BlockOnBallHistory()
     list(whole.increments(3.0, csv=folder / "whole.csv"))
     files = {"checkpoint": folder / "state.npz", "csv": folder / "parts.csv"}
     for step in made.increments(3.0, checkpoint_every=2, **files):
@@ -120,20 +120,20 @@ def test_restart_replaces_the_rows_after_the_checkpoint(tmp_path):
         "floor: normal force (force per thickness)",
         "floor: force x (force per thickness)",
     ):
-        assert close(numbers(rows, column), numbers(expected, column), whole.tolerance)
+        assert is_close(numbers(rows, column), numbers(expected, column), whole.tolerance)
     # A completed history computes nothing and does not change the table.
-    done = Press()
+    done = BlockOnBallHistory()
     assert list(done.increments(3.0, **files)) == []
     assert table(folder / "parts.csv") == rows
     # A new history, without a checkpoint, replaces the table.
-    next(iter(Press().increments(3.0, csv=files["csv"])))
+    next(iter(BlockOnBallHistory().increments(3.0, csv=files["csv"])))
     assert [row["increment"] for row in table(folder / "parts.csv")] == ["1"]
 
 
 def test_cuts_errors_and_failures(tmp_path, monkeypatch):
     """Rows contain the errors of `estimate` and the number of cuts, and remain after a failure."""
     folder = shared_folder(tmp_path)
-    made = Press()
+    made = BlockOnBallHistory()
     solve, calls = made.problem.solve, []
 
     def failing(**options):
@@ -151,7 +151,7 @@ def test_cuts_errors_and_failures(tmp_path, monkeypatch):
     cuts = numbers(table(folder / "cut.csv"), "cuts")
     assert cuts == [0.0, 1.0, 0.0]
 
-    made = Press()
+    made = BlockOnBallHistory()
     steps = list(made.increments(1.0, steps=2, estimate=True, csv=folder / "errors.csv"))
     rows = table(folder / "errors.csv")
     for name, unit in (("normal force", "force"), ("peak pressure", "stress")):
@@ -160,7 +160,7 @@ def test_cuts_errors_and_failures(tmp_path, monkeypatch):
         assert found == ["" if e is None else str(float(e)) for e in expected]
         assert found[0] == "" != found[1]
 
-    made = Press()
+    made = BlockOnBallHistory()
     path = folder / "failed.csv"
     history = made.increments(1.5, steps=2, max_cuts=0, csv=path)
     next(history)
@@ -173,7 +173,7 @@ def test_cuts_errors_and_failures(tmp_path, monkeypatch):
 def test_wrong_input(tmp_path):
     """Wrong input raises on all ranks before the first increment; existing files are unchanged."""
     folder = shared_folder(tmp_path)
-    made = Rub()
+    made = BlockOnBall()
     if COMM.rank == 0:
         (folder / "letter.txt").write_text("Dear reader")
     COMM.barrier()
@@ -183,22 +183,22 @@ def test_wrong_input(tmp_path):
             iter(fc.increments(problem.problem, problem.load, csv=history, **options))
         )
 
-    raised_everywhere(call(3), ValueError, "csv", "name of a file")
-    raised_everywhere(call(folder / "no" / "h.csv"), ValueError, "no folder", "create it")
-    raised_everywhere(call(folder / "letter.txt"), ValueError, "letter.txt", "overwritten")
-    raised_everywhere(call(folder), OSError, str(folder.name))
+    assert_raised_on_all_ranks(call(3), ValueError, "csv", "name of a file")
+    assert_raised_on_all_ranks(call(folder / "no" / "h.csv"), ValueError, "no folder", "create it")
+    assert_raised_on_all_ranks(call(folder / "letter.txt"), ValueError, "letter.txt", "overwritten")
+    assert_raised_on_all_ranks(call(folder), OSError, str(folder.name))
     assert sorted(os.listdir(folder)) == ["letter.txt"] and made.problem.increment == 0
     assert (folder / "letter.txt").read_text() == "Dear reader"
 
     path = folder / "h.csv"
     call(path, steps=2)()
-    other = Rub(contact={"name": "other"})
+    other = BlockOnBall(contact={"name": "other"})
     call(folder / "other.csv", other, steps=2)()
     before = path.read_bytes()
     again = lambda: next(  # noqa: E731
         iter(fc.increments(other.problem, other.load, 0.5, 1.0, csv=path))
     )
-    raised_everywhere(again, ValueError, "columns differ")
+    assert_raised_on_all_ranks(again, ValueError, "columns differ")
     assert path.read_bytes() == before
     COMM.barrier()
     if COMM.rank == 0:
@@ -207,7 +207,7 @@ def test_wrong_input(tmp_path):
     again = lambda: next(  # noqa: E731
         iter(fc.increments(made.problem, made.load, 0.5, 1.0, csv=path))
     )
-    raised_everywhere(again, ValueError, "damaged in line 3")
+    assert_raised_on_all_ranks(again, ValueError, "damaged in line 3")
 
 
 def test_paths_that_are_not_regular_files_are_refused(tmp_path):
@@ -218,7 +218,7 @@ def test_paths_that_are_not_regular_files_are_refused(tmp_path):
     """
     folder = shared_folder(tmp_path)
     pipe = folder / "pipe"
-    made = Rub()
+    made = BlockOnBall()
     if COMM.rank == 0:
         os.mkfifo(pipe)
     COMM.barrier()
@@ -227,7 +227,7 @@ def test_paths_that_are_not_regular_files_are_refused(tmp_path):
         return lambda: next(iter(fc.increments(made.problem, made.load, **options)))
 
     for options in ({"csv": pipe}, {"checkpoint": pipe}):
-        raised_everywhere(call(**options), ValueError, "pipe", "give the name of a file")
+        assert_raised_on_all_ranks(call(**options), ValueError, "pipe", "give the name of a file")
     with pytest.raises(ValueError, match="would replace"), files.atomic_write(pipe) as path:
         path.write_bytes(b"")
     assert pipe.is_fifo() and os.listdir(folder) == ["pipe"]
@@ -237,7 +237,7 @@ def test_paths_that_are_not_regular_files_are_refused(tmp_path):
 def test_failed_write_leaves_table_and_state_unchanged(tmp_path, monkeypatch):
     """A failed write raises on all ranks, leaves no partial row, and keeps the committed state."""
     path = shared_folder(tmp_path) / "h.csv"
-    made = Rub()
+    made = BlockOnBall()
     history = fc.increments(made.problem, made.load, steps=3, csv=path)
     next(history)
     before = path.read_bytes()
@@ -248,7 +248,7 @@ def test_failed_write_leaves_table_and_state_unchanged(tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
-        raised_everywhere(lambda: next(history), OSError, "no space left")
+        assert_raised_on_all_ranks(lambda: next(history), OSError, "no space left")
     assert path.read_bytes() == before
     COMM.barrier()
     assert made.problem.increment == 2
@@ -257,11 +257,11 @@ def test_failed_write_leaves_table_and_state_unchanged(tmp_path, monkeypatch):
 def test_moments_and_point_counts_with_finite_kinematics(tmp_path):
     """Moments use the deformed positions of Γc, and the numbers of points include all ranks."""
     path = shared_folder(tmp_path) / "h.csv"
-    made = Tool(law=fc.Frictionless(1e4))
+    made = DiscOnRubber(law=fc.Frictionless(1e4))
     (step,) = made.increments(1.0, steps=1, csv=path)
     (row,) = table(path)
     moment = float(row["contact: moment z about the origin (force length per thickness)"])
-    assert close([moment], made.contact.moment((0.0, 0.0)), 1e-12)
+    assert is_close([moment], made.contact.moment((0.0, 0.0)), 1e-12)
     points = sum(int(row[f"contact: {s} (points)"]) for s in ("open", "stick", "slip"))
     assert points == COMM.allreduce(len(made.contact.points))
     # Reference: sum of lever arm times force; the origin is the middle of the block's bottom.
@@ -297,11 +297,13 @@ def test_units_with_a_thickness(tmp_path):
         assert step.contacts["contact"].per_thickness == (weight is None)
     (plain, row), (thick, whole) = found
     one, all_of_it = plain.contacts["contact"], thick.contacts["contact"]
-    assert close([all_of_it.area, *all_of_it.force], thickness * np.r_[one.area, one.force], 1e-8)
+    assert is_close(
+        [all_of_it.area, *all_of_it.force], thickness * np.r_[one.area, one.force], 1e-8
+    )
     assert len(row) == len(whole)
     for before, after in zip(row, whole, strict=True):
         assert before.replace(" per thickness)", ")") == after
         integral = any(f"({unit}" in before for unit in ("force)", "force ", "area"))
         assert (before == after) == (not integral), before
     area = "contact: area in contact (area)"
-    assert close(float(whole[area]), thickness * float(row[area[:-1] + " per thickness)"]), 1e-8)
+    assert is_close(float(whole[area]), thickness * float(row[area[:-1] + " per thickness)"]), 1e-8)

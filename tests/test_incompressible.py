@@ -11,8 +11,14 @@ from dolfinx import fem
 import fenics_contact as fc
 from fenics_contact.elasticity import NeoHookean
 from fenics_contact.parallel import global_max
-from scenes.blocks import BOTTOM, block_mesh, dimension, wave
-from scenes.comparing import assemble_matrix, assemble_owned, close, compiled, owned
+from scenes.blocks import BOTTOM, block_mesh, dimension, rough_field
+from scenes.comparison import (
+    assemble_matrix,
+    assemble_owned,
+    compile_with_maps,
+    is_close,
+    owned_values,
+)
 from scenes.rubber import MIXED, disc, mixed_space, rubber, split
 
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
@@ -45,10 +51,12 @@ def test_tangent_is_the_symmetric_derivative_of_the_residual(nu, kind, isochoric
     w, direction, other = (fem.Function(mixed_space(mesh, "Taylor-Hood")) for _ in range(3))
     amplitude = 0.01 if kind == "3D" else 0.05  # of the waves, which are steep in three dimensions
     for function, seed, size in ((w, 0, amplitude), (direction, 1, 1.0), (other, 2, 1.0)):
-        function.sub(0).interpolate(lambda x, s=seed, a=size: a * wave(dimension(cell), s)(x))
+        function.sub(0).interpolate(
+            lambda x, s=seed, a=size: a * rough_field(dimension(cell), s)(x)
+        )
         function.sub(1).interpolate(lambda x, s=seed, a=size: 300 * a * np.cos(3 * x[0] + s))
     _, F = body_of(w, nu, kind, isochoric)
-    form, start = compiled(F), w.x.array.copy()
+    form, start = compile_with_maps(F), w.x.array.copy()
 
     def residual(step):
         w.x.array[:] = start + step * direction.x.array
@@ -56,7 +64,7 @@ def test_tangent_is_the_symmetric_derivative_of_the_residual(nu, kind, isochoric
 
     difference = (residual(1e-5) - residual(-1e-5)) / 2e-5
     w.x.array[:] = start
-    tangent = assemble_matrix(compiled(ufl.derivative(F, w)))
+    tangent = assemble_matrix(compile_with_maps(ufl.derivative(F, w)))
     product, mirrored = tangent.createVecLeft(), tangent.createVecLeft()
     tangent.mult(direction.x.petsc_vec, product)
     tangent.multTranspose(direction.x.petsc_vec, mirrored)
@@ -145,7 +153,7 @@ def test_column_at_large_strain(nu, kind, isochoric):
     area = {"plane strain": 2.0, "axisymmetric": np.pi * 4.0, "3D": 4.0}[kind]
     assert step.contacts["contact"].normal_force == pytest.approx(-nominal * area, rel=1e-6)
     found = w.sub(1).collapse()
-    assert close(owned(found), np.full_like(owned(found), pressure), 1e-6, scale=E)
+    assert is_close(owned_values(found), np.full_like(owned_values(found), pressure), 1e-6, scale=E)
     hoop = 1.0 if kind == "plane strain" else across
     axis = 2 if d == 3 else 1
     volume = mesh.comm.allreduce(fem.assemble_scalar(fem.form(fem.Constant(mesh, 1.0) * ufl.dx)))

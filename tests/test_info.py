@@ -17,7 +17,7 @@ import fenics_contact as fc
 from fenics_contact import __main__ as program
 from fenics_contact import compiling
 from fenics_contact.installation import information
-from scenes.comparing import raised_everywhere
+from scenes.comparison import assert_raised_on_all_ranks
 
 COMM = MPI.COMM_WORLD
 
@@ -61,7 +61,7 @@ def test_info_command_prints_on_the_first_rank(capsys):
     lines = COMM.bcast(printed).splitlines()
     assert any(line.split() == ["DOLFINx", dolfinx.__version__] for line in lines)
     assert (printed == "") == (COMM.rank != 0)
-    raised_everywhere(lambda: exits(["formation"]), RuntimeError, "2")
+    assert_raised_on_all_ranks(lambda: exits(["formation"]), RuntimeError, "2")
 
 
 def exits(words):

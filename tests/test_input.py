@@ -9,9 +9,9 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact import parallel
 from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block, block_mesh
-from scenes.comparing import raised_everywhere
+from scenes.comparison import assert_raised_on_all_ranks
 from scenes.elasticity import strain, stress
-from scenes.sound import MESH, build_and_solve, coulomb, pressed
+from scenes.valid_problem import LAYERED_MESH, coulomb_law, make_solve, pressed_block
 
 pytestmark = [
     pytest.mark.newest,
@@ -23,7 +23,7 @@ COMM = MPI.COMM_WORLD
 
 def test_valid_scene_is_solved():
     """The scene in which the tests below change one input is valid: it carries its load, 1."""
-    step = build_and_solve(pressed())()
+    step = make_solve(pressed_block())()
     # Equilibrium to the solver's tolerance, 1e-9 of the forces.
     assert step.contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
 
@@ -34,11 +34,11 @@ def test_load_that_is_zero_in_ufl_is_no_error():
     The top moves down by 1e-3 of a height of 1, with rollers at x = 0 and the other side free:
     plane strain and a penalty of 1e4 in series, 1/(1/k_n + (1 - ν²)/E), to 1e-8.
     """
-    scene = block("quadrilateral", 1, **MESH)
+    scene = block("quadrilateral", 1, **LAYERED_MESH)
     v = ufl.TestFunction(scene.u.function_space)
     F = ufl.inner(stress(scene.u, scene.E, scene.nu), strain(v)) * ufl.dx
     F -= 0 * v[0] * ufl.ds(scene.mesh, subdomain_data=scene.tags)(TOP)
-    bcs = [*scene.rollers(), scene.hold(TOP, 1, -1e-3)]
+    bcs = [*scene.rollers(), scene.dirichlet_bc(TOP, 1, -1e-3)]
     contact = scene.contact(fc.Frictionless(k_n=1e4))
     step = fc.ContactProblem(F, scene.u, bcs=bcs, contacts=[contact]).solve()
     exact = 1e-3 / (1e-4 + (1 - 0.3**2) / 1000)
@@ -47,8 +47,8 @@ def test_load_that_is_zero_in_ufl_is_no_error():
 
 def test_form_without_stiffness_is_refused():
     """A modulus of zero is detected before it leads to a singular matrix."""
-    scene = pressed(E=0.0)
-    raised_everywhere(build_and_solve(scene), ValueError, "stiffness")
+    scene = pressed_block(E=0.0)
+    assert_raised_on_all_ranks(make_solve(scene), ValueError, "stiffness")
 
 
 # ---- not finite ----------------------------------------------------------------------------------
@@ -59,18 +59,18 @@ def test_form_without_stiffness_is_refused():
 @pytest.mark.parametrize("name", ["traction", "body_force", "E", "nu"])
 def test_constants_that_are_not_finite_are_refused(name, value):
     """A load or modulus that is not finite is refused by the first and by later solves."""
-    scene = pressed()
+    scene = pressed_block()
     constant = getattr(scene, name)
     good = constant.value.copy()
     constant.value = np.full_like(constant.value, value)
-    raised_everywhere(build_and_solve(scene), ValueError, "finite", "constant")
+    assert_raised_on_all_ranks(make_solve(scene), ValueError, "finite", "constant")
     constant.value = good
-    problem, _ = scene.problem(coulomb(), scene.rollers())
+    problem, _ = scene.problem(coulomb_law(), scene.rollers())
     problem.solve()
     problem.commit()
     before = scene.u.x.array.copy()
     constant.value = np.full_like(constant.value, value)
-    raised_everywhere(problem.solve, ValueError, "finite", "constant")
+    assert_raised_on_all_ranks(problem.solve, ValueError, "finite", "constant")
     assert all(COMM.allgather(bool(np.array_equal(scene.u.x.array, before))))
     # With a finite constant the problem is solved again.
     constant.value = good
@@ -79,34 +79,34 @@ def test_constants_that_are_not_finite_are_refused(name, value):
 
 def test_infinite_stiffness_is_refused():
     """ν = 0.5, set between increments, makes λ infinite: the error names ν = 0.5 as a cause."""
-    scene = pressed()
-    problem, _ = scene.problem(coulomb(), scene.rollers())
+    scene = pressed_block()
+    problem, _ = scene.problem(coulomb_law(), scene.rollers())
     problem.solve()
     problem.commit()
     scene.nu.value = 0.5
-    raised_everywhere(problem.solve, ValueError, "F at u = 0", "not finite", "ν = 0.5")
+    assert_raised_on_all_ranks(problem.solve, ValueError, "F at u = 0", "not finite", "ν = 0.5")
 
 
-@pytest.mark.parametrize("way", [1e8, 1e9])
-def test_mesh_too_far_from_the_origin_is_refused(way):
+@pytest.mark.parametrize("offset", [1e8, 1e9])
+def test_mesh_too_far_from_the_origin_is_refused(offset):
     """If coordinates are round-off the mesh is refused; nearer to the origin the load is carried.
 
     At 1e8 coordinates have a round-off of 1e-8 of the mesh; forces balance to 1e-8 of the load.
     """
-    mesh, tags = block_mesh("quadrilateral", **MESH)
-    mesh.geometry.x[:, :2] += way
+    mesh, tags = block_mesh("quadrilateral", **LAYERED_MESH)
+    mesh.geometry.x[:, :2] += offset
     u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (2,))))
     v = ufl.TestFunction(u.function_space)
     F = ufl.inner(stress(u, 1000.0, 0.3), strain(v)) * ufl.dx
     F += v[1] * ufl.ds(mesh, subdomain_data=tags)(TOP)
-    obstacle = fc.HalfSpace((way, way), (0, 1))
-    contact = fc.Contact(u, fc.ContactSurface(mesh, tags, BOTTOM), obstacle, coulomb())
+    obstacle = fc.HalfSpace((offset, offset), (0, 1))
+    contact = fc.Contact(u, fc.ContactSurface(mesh, tags, BOTTOM), obstacle, coulomb_law())
 
     def call():
         return fc.ContactProblem(F, u, contacts=[contact]).solve()
 
-    if way > 1e8:
-        raised_everywhere(call, ValueError, "contact", "origin", "1e+09")
+    if offset > 1e8:
+        assert_raised_on_all_ranks(call, ValueError, "contact", "origin", "1e+09")
     else:
         assert call().contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
 
@@ -114,7 +114,7 @@ def test_mesh_too_far_from_the_origin_is_refused(way):
 @pytest.mark.parametrize("what", ["load", "modulus"])
 def test_function_that_is_nan_on_one_rank_is_refused(what):
     """A coefficient function with NaN in cells of one rank is named on all ranks."""
-    scene = pressed()
+    scene = pressed_block()
     field = fem.Function(fem.functionspace(scene.mesh, ("DG", 0)), name=f"the {what}")
     field.x.array[:] = 1.0
     centers = field.function_space.tabulate_dof_coordinates()
@@ -125,7 +125,7 @@ def test_function_that_is_nan_on_one_rank_is_refused(what):
         scene.F -= field * v[1] * dx
     else:
         scene.F += ufl.inner(field * strain(scene.u), strain(v)) * dx
-    raised_everywhere(build_and_solve(scene), ValueError, f"the {what}", "finite")
+    assert_raised_on_all_ranks(make_solve(scene), ValueError, f"the {what}", "finite")
 
 
 @pytest.mark.whole
@@ -133,51 +133,51 @@ def test_function_that_is_nan_on_one_rank_is_refused(what):
 @pytest.mark.parametrize("kind", ["constant", "function"])
 def test_dirichlet_value_that_is_not_finite_is_refused(kind, value):
     """The value is a constant, or a function with one such dof, and thus on one rank only."""
-    scene = pressed()
+    scene = pressed_block()
     if kind == "constant":
-        bc = scene.hold(TOP, 1, value)
+        bc = scene.dirichlet_bc(TOP, 1, value)
     else:
         given = fem.Function(scene.u.function_space)
         x = scene.u.function_space.tabulate_dof_coordinates()
         corner = np.flatnonzero(np.isclose(x[:, 0], 1.0) & np.isclose(x[:, 1], 1.0))
         given.x.array[2 * corner] = value
         bc = fem.dirichletbc(given, scene.facet_dofs(TOP))
-    raised_everywhere(
-        build_and_solve(scene, bcs=[*scene.rollers(), bc]), ValueError, "Dirichlet", "finite"
+    assert_raised_on_all_ranks(
+        make_solve(scene, bcs=[*scene.rollers(), bc]), ValueError, "Dirichlet", "finite"
     )
 
 
 def test_initial_displacement_that_is_nan_on_one_rank_is_refused():
     """An initial u with one NaN is refused on all ranks."""
-    scene = pressed()
+    scene = pressed_block()
     x = scene.u.function_space.tabulate_dof_coordinates()
     corner = np.flatnonzero(np.isclose(x[:, 0], 1.0) & np.isclose(x[:, 1], 1.0))
     scene.u.x.array[2 * corner] = np.nan
-    raised_everywhere(build_and_solve(scene), ValueError, "'u'", "finite")
+    assert_raised_on_all_ranks(make_solve(scene), ValueError, "'u'", "finite")
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 def test_obstacle_displacement_that_is_nan_is_refused(kinematics):
     """An obstacle whose displacement becomes NaN between two increments is refused."""
-    scene = pressed()
+    scene = pressed_block()
     motion = fem.Constant(scene.mesh, np.zeros(2))
     options = {"displacement": motion, "kinematics": kinematics}
-    problem, _ = scene.problem(coulomb(), scene.rollers(), contact=options)
+    problem, _ = scene.problem(coulomb_law(), scene.rollers(), contact=options)
     problem.solve()
     motion.value[1] = np.nan
-    raised_everywhere(problem.solve, ValueError, "displacement", "finite")
+    assert_raised_on_all_ranks(problem.solve, ValueError, "displacement", "finite")
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 def test_tangential_obstacle_displacement_that_is_nan_is_refused(kinematics):
     """A tangential displacement of NaN is refused, although it need not enter the gap."""
-    scene = pressed()
+    scene = pressed_block()
     motion = fem.Constant(scene.mesh, np.zeros(2))
     options = {"displacement": motion, "kinematics": kinematics}
-    problem, _ = scene.problem(coulomb(), scene.rollers(), contact=options)
+    problem, _ = scene.problem(coulomb_law(), scene.rollers(), contact=options)
     problem.solve()
     motion.value[0] = np.nan
-    raised_everywhere(problem.solve, ValueError, "finite")
+    assert_raised_on_all_ranks(problem.solve, ValueError, "finite")
 
 
 # ---- Dirichlet conditions on Γc ------------------------------------------------------------------
@@ -185,25 +185,25 @@ def test_tangential_obstacle_displacement_that_is_nan_is_refused(kinematics):
 
 def test_clamped_contact_surface_is_refused():
     """Γc with all displacements prescribed, by one condition or by components, is refused."""
-    scene = pressed()
+    scene = pressed_block()
     dofs = scene.facet_dofs(BOTTOM)
     clamp = fem.dirichletbc(np.zeros(2), dofs, scene.u.function_space)
-    for bcs in ([clamp], [scene.hold(BOTTOM, 0), scene.hold(BOTTOM, 1)]):
-        raised_everywhere(
-            lambda bcs=bcs: scene.problem(coulomb(), bcs), ValueError, "contact", "Dirichlet"
+    for bcs in ([clamp], [scene.dirichlet_bc(BOTTOM, 0), scene.dirichlet_bc(BOTTOM, 1)]):
+        assert_raised_on_all_ranks(
+            lambda bcs=bcs: scene.problem(coulomb_law(), bcs), ValueError, "contact", "Dirichlet"
         )
 
 
 def test_contact_surface_with_one_clamped_facet_is_refused():
     """One facet of Γc is clamped, on one rank: the error is raised on all ranks."""
-    scene = pressed()
+    scene = pressed_block()
     surface = fc.ContactSurface(scene.mesh, scene.tags, [BOTTOM, RIGHT])
-    contact = fc.Contact(scene.u, surface, scene.floor(), coulomb())
+    contact = fc.Contact(scene.u, surface, scene.floor(), coulomb_law())
     x = scene.u.function_space.tabulate_dof_coordinates()
     n_owned = scene.u.function_space.dofmap.index_map.size_local
     ends = np.flatnonzero((x[:n_owned, 1] > 0.7) & (x[:n_owned, 0] > 0.9)).astype(np.int32)
     clamp = fem.dirichletbc(np.zeros(2), ends, scene.u.function_space)
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: fc.ContactProblem(scene.F, scene.u, bcs=[clamp], contacts=[contact]),
         ValueError,
         "1 facets",
@@ -212,13 +212,13 @@ def test_contact_surface_with_one_clamped_facet_is_refused():
 
 def test_partly_constrained_contact_surface_is_solved():
     """Γc may have a prescribed tangential displacement, or share an edge with a clamped side."""
-    scene = pressed()
-    problem, _ = scene.problem(coulomb(), [scene.hold(BOTTOM, 0)])
+    scene = pressed_block()
+    problem, _ = scene.problem(coulomb_law(), [scene.dirichlet_bc(BOTTOM, 0)])
     step = problem.solve()
     assert step.contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
-    scene = pressed()
+    scene = pressed_block()
     clamp = fem.dirichletbc(np.zeros(2), scene.facet_dofs(LEFT), scene.u.function_space)
-    problem, _ = scene.problem(coulomb(), [clamp])
+    problem, _ = scene.problem(coulomb_law(), [clamp])
     problem.solve()
 
 
@@ -229,13 +229,13 @@ def test_partly_constrained_contact_surface_is_solved():
 def test_load_away_from_the_obstacle_is_refused(cell):
     """No contact force can balance a load away from the obstacle without a Dirichlet condition."""
     scene = block(cell, up=1.0)
-    raised_everywhere(build_and_solve(scene), ValueError, "balance", "translation along")
+    assert_raised_on_all_ranks(make_solve(scene), ValueError, "balance", "translation along")
     scene = block(cell, up=1.0)
-    raised_everywhere(build_and_solve(scene, bcs=[]), ValueError, "balance")
+    assert_raised_on_all_ranks(make_solve(scene, bcs=[]), ValueError, "balance")
     # With the normal displacement of the top prescribed elasticity balances the load.
     scene = block(cell, up=1.0)
-    held = [*scene.rollers(), scene.hold(TOP, scene.dim - 1)]
-    step = build_and_solve(scene, bcs=held)()
+    held = [*scene.rollers(), scene.dirichlet_bc(TOP, scene.dim - 1)]
+    step = make_solve(scene, bcs=held)()
     assert step.contacts["contact"].normal_force <= 1e-8
 
 
@@ -245,19 +245,23 @@ def test_sliding_modes_without_friction_are_refused(cell):
     scene = block(cell, up=-1.0, side=0.1)
     words = ["translation along x"] + (["translation along y"] if scene.dim == 3 else [])
     frictionless = fc.Frictionless(k_n=1e4)
-    raised_everywhere(lambda: scene.problem(frictionless, []), ValueError, "constrain", *words)
+    assert_raised_on_all_ranks(
+        lambda: scene.problem(frictionless, []), ValueError, "constrain", *words
+    )
     # μ = 0 is no friction either.
-    raised_everywhere(lambda: scene.problem(coulomb(0.0), []), ValueError, "constrain", *words)
-    problem, _ = scene.problem(coulomb(0.3), [])
+    assert_raised_on_all_ranks(
+        lambda: scene.problem(coulomb_law(0.0), []), ValueError, "constrain", *words
+    )
+    problem, _ = scene.problem(coulomb_law(0.3), [])
     problem.solve()
 
 
 def test_rotation_in_a_frictionless_cavity_is_refused():
     """A body inside a round cavity without friction can rotate about its axis, which is named."""
-    scene = pressed()
+    scene = pressed_block()
     # The cavity's axis is the middle of the block: a rotation about it changes no gap.
     cavity = fc.Ball((0.5, 0.5), 2.0, inside=True)
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: scene.problem(fc.Frictionless(k_n=1e4), [], contact={"obstacle": cavity}),
         ValueError,
         "rotation about z",
@@ -266,8 +270,8 @@ def test_rotation_in_a_frictionless_cavity_is_refused():
 
 def test_body_without_contact_or_conditions_is_refused():
     """A body without contact or Dirichlet conditions is unconstrained: all its modes are named."""
-    scene = pressed()
-    raised_everywhere(
+    scene = pressed_block()
+    assert_raised_on_all_ranks(
         lambda: fc.ContactProblem(scene.F, scene.u),
         ValueError,
         "translation along x",
@@ -283,10 +287,10 @@ def test_load_above_the_friction_limit_is_refused(cell):
     It is larger by a sixth: in space the check encloses the cone by a polygon that is 8 % too wide.
     """
     scene = block(cell, up=-1.0, side=0.35)
-    problem, _ = scene.problem(coulomb(0.3), [])
-    raised_everywhere(problem.solve, ValueError, "balance", "translation along x")
+    problem, _ = scene.problem(coulomb_law(0.3), [])
+    assert_raised_on_all_ranks(problem.solve, ValueError, "balance", "translation along x")
     # More friction balances the load; its moment does not tip the block (0.35 < 0.5).
-    held, _ = scene.problem(coulomb(0.5), [])
+    held, _ = scene.problem(coulomb_law(0.5), [])
     step = held.solve()
     resultants = step.contacts["contact"]
     # Equilibrium; 1e-7 is a hundred times the solver's tolerance on forces.
@@ -300,15 +304,15 @@ def test_load_that_tips_the_body_is_refused(cell):
     A side force H at the top of a unit block tips it over the edge from H = V/2 on.
     """
     scene = block(cell, up=-1.0, side=0.6)
-    problem, _ = scene.problem(coulomb(2.0), [])
-    raised_everywhere(problem.solve, ValueError, "balance", "rotation")
+    problem, _ = scene.problem(coulomb_law(2.0), [])
+    assert_raised_on_all_ranks(problem.solve, ValueError, "balance", "rotation")
 
 
 def test_next_increment_is_solved_after_a_refused_load():
     """A refused load leaves the state unchanged: the next, valid one is solved."""
     scene = block("quadrilateral", up=1.0)
-    problem, _ = scene.problem(coulomb(), scene.rollers())
-    raised_everywhere(problem.solve, ValueError, "balance")
+    problem, _ = scene.problem(coulomb_law(), scene.rollers())
+    assert_raised_on_all_ranks(problem.solve, ValueError, "balance")
     assert all(COMM.allgather(bool(np.all(scene.u.x.array == 0.0))))
     scene.load(up=-1.0)
     step = problem.solve()
@@ -323,9 +327,9 @@ def test_load_and_friction_limit_are_stated(cell):
     for over in (1.01, 1.08):
         scene = block(cell, up=-pressure, side=over * friction * pressure)
         told = [*words, f"{over * friction * pressure:.6g}"]
-        raised_everywhere(build_and_solve(scene, coulomb(friction), []), ValueError, *told)
+        assert_raised_on_all_ranks(make_solve(scene, coulomb_law(friction), []), ValueError, *told)
     scene = block(cell, up=-pressure, side=0.99 * friction * pressure)
-    assert build_and_solve(scene, coulomb(friction), [])().verdict.failures == []
+    assert make_solve(scene, coulomb_law(friction), [])().verdict.failures == []
 
 
 # ---- collective errors and sums ------------------------------------------------------------------
@@ -340,9 +344,9 @@ def test_error_of_one_rank_is_raised_on_all():
             if COMM.rank == last:
                 raise kind("here only")
 
-    raised_everywhere(lambda: fail(ValueError), ValueError, "here only")
-    raised_everywhere(lambda: fail(TypeError), TypeError, "here only")
-    raised_everywhere(lambda: fail(OSError), (OSError, RuntimeError), "here only")
+    assert_raised_on_all_ranks(lambda: fail(ValueError), ValueError, "here only")
+    assert_raised_on_all_ranks(lambda: fail(TypeError), TypeError, "here only")
+    assert_raised_on_all_ranks(lambda: fail(OSError), (OSError, RuntimeError), "here only")
     with parallel.collective_errors(COMM):
         pass
 
@@ -367,13 +371,15 @@ def test_reductions_over_ranks():
 @pytest.mark.parametrize("field", [True, False])
 def test_mesh_moved_between_increments_is_refused(field):
     """Points, gaps and stiffness belong to the original nodes: moved nodes are refused."""
-    scene = pressed()
-    problem, contact = scene.problem(coulomb(), scene.rollers())
+    scene = pressed_block()
+    problem, contact = scene.problem(coulomb_law(), scene.rollers())
     problem.solve(recover_interior=field)
     problem.commit()
     before = contact.history.rows()
     scene.mesh.geometry.x[:, 0] *= 1.3
-    raised_everywhere(lambda: problem.solve(recover_interior=field), ValueError, "moved", "0.3")
+    assert_raised_on_all_ranks(
+        lambda: problem.solve(recover_interior=field), ValueError, "moved", "0.3"
+    )
     assert np.array_equal(contact.history.rows(), before) and problem.increment == 1
     scene.mesh.geometry.x[:, 0] /= 1.3
     fc.ContactSurface(scene.mesh, scene.tags, BOTTOM)  # the scaled mesh is reset

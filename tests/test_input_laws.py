@@ -9,8 +9,8 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.blocks import Block, block
-from scenes.comparing import close, raised_everywhere
-from scenes.sound import build_and_solve, coulomb, pressed
+from scenes.comparison import assert_raised_on_all_ranks, is_close
+from scenes.valid_problem import coulomb_law, make_solve, pressed_block
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
@@ -37,29 +37,31 @@ BAD_NUMBERS = [
 @pytest.mark.parametrize(("name", "value"), BAD_NUMBERS)
 def test_parameter_out_of_range_by_number(name, value):
     """`Contact` refuses the numbers μ < 0, k_n ≤ 0, k_t ≤ 0 and those that are not finite."""
-    scene = pressed()
-    raised_everywhere(lambda: scene.contact(coulomb(**{name: value})), ValueError, name, "contact")
+    scene = pressed_block()
+    assert_raised_on_all_ranks(
+        lambda: scene.contact(coulomb_law(**{name: value})), ValueError, name, "contact"
+    )
 
 
 @pytest.mark.whole
 @pytest.mark.parametrize(("name", "value"), BAD_NUMBERS)
 def test_parameter_out_of_range_by_constant(name, value):
     """`ContactProblem` refuses a ``fem.Constant`` that is out of range."""
-    scene = pressed()
-    law = coulomb(**{name: fem.Constant(scene.mesh, float(value))})
-    raised_everywhere(lambda: scene.problem(law, scene.rollers()), ValueError, name)
+    scene = pressed_block()
+    law = coulomb_law(**{name: fem.Constant(scene.mesh, float(value))})
+    assert_raised_on_all_ranks(lambda: scene.problem(law, scene.rollers()), ValueError, name)
 
 
 @pytest.mark.each
 @pytest.mark.parametrize(("name", "value"), BAD_NUMBERS)
 def test_parameter_out_of_range_after_a_change(name, value):
     """The next solve refuses a parameter set out of range, and leaves u unchanged."""
-    scene = pressed()
-    problem, contact = scene.problem(coulomb(), scene.rollers())
+    scene = pressed_block()
+    problem, contact = scene.problem(coulomb_law(), scene.rollers())
     problem.solve()
     before = scene.u.x.array.copy()
     contact.parameters[name].value = value
-    raised_everywhere(problem.solve, ValueError, name)
+    assert_raised_on_all_ranks(problem.solve, ValueError, name)
     assert all(COMM.allgather(bool(np.array_equal(scene.u.x.array, before))))
 
 
@@ -77,20 +79,22 @@ def test_parameter_out_of_range_after_a_change(name, value):
 )
 def test_parameter_out_of_range_by_ufl(name, expression):
     """A UFL expression out of range at some points, in parallel on some ranks, is refused."""
-    scene = pressed()
-    law = coulomb(**{name: expression(ufl.SpatialCoordinate(scene.mesh))})
-    raised_everywhere(lambda: scene.problem(law, scene.rollers()), ValueError, name)
+    scene = pressed_block()
+    law = coulomb_law(**{name: expression(ufl.SpatialCoordinate(scene.mesh))})
+    assert_raised_on_all_ranks(lambda: scene.problem(law, scene.rollers()), ValueError, name)
 
 
 @pytest.mark.parametrize("value", [-1.0, np.nan])
 def test_parameter_out_of_range_at_one_point(value):
     """All ranks raise if a function is out of range in one cell, thus on one rank."""
-    scene = pressed()
+    scene = pressed_block()
     mu = fem.Function(fem.functionspace(scene.mesh, ("DG", 0)))
     mu.x.array[:] = 0.3
     centers = mu.function_space.tabulate_dof_coordinates()
     mu.x.array[(centers[:, 0] < 0.5) & (centers[:, 1] < 0.25)] = value
-    raised_everywhere(lambda: scene.problem(coulomb(mu), scene.rollers()), ValueError, "friction")
+    assert_raised_on_all_ranks(
+        lambda: scene.problem(coulomb_law(mu), scene.rollers()), ValueError, "friction"
+    )
 
 
 def in_space() -> Block:
@@ -103,7 +107,7 @@ def in_space() -> Block:
 def test_number_of_polygon_sides_is_invalid(value):
     """The law refuses a number of polygon sides that is not an integer of at least 3."""
     for law in (fc.Coulomb, lambda mu, **kwargs: fc.Tresca(mu, 1.0, **kwargs)):
-        raised_everywhere(
+        assert_raised_on_all_ranks(
             lambda law=law: law(0.3, modes=value), ValueError, "modes", repr(value), "at least 3"
         )
 
@@ -117,17 +121,21 @@ def test_number_of_polygon_sides_is_invalid(value):
 )
 def test_friction_directions_in_two_dimensions(name, options):
     """Polygonal and elliptic friction need a tangent plane: refused in two dimensions."""
-    scene = pressed()
+    scene = pressed_block()
     law = fc.Coulomb(0.3, k_n=1e4, k_t=1e3, **options)
-    raised_everywhere(lambda: scene.contact(law), ValueError, "contact", name, "two dimensions")
+    assert_raised_on_all_ranks(
+        lambda: scene.contact(law), ValueError, "contact", name, "two dimensions"
+    )
 
 
 def test_direction_of_friction_missing_or_unused():
     """An ellipse without direction, and a direction for a circular cone, are refused."""
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: fc.Coulomb(0.3, transverse_friction=0.1), ValueError, "direction", "missing"
     )
-    raised_everywhere(lambda: fc.Coulomb(0.3, direction=(1, 0, 0)), ValueError, "direction", "cone")
+    assert_raised_on_all_ranks(
+        lambda: fc.Coulomb(0.3, direction=(1, 0, 0)), ValueError, "direction", "cone"
+    )
 
 
 def elliptic(friction=0.3, transverse_friction=0.1, direction=(1.0, 0.0, 0.0)) -> fc.Coulomb:
@@ -138,7 +146,7 @@ def elliptic(friction=0.3, transverse_friction=0.1, direction=(1.0, 0.0, 0.0)) -
 
 def test_elliptic_friction_is_solved():
     """The valid input of the tests below is solved, with the load of 1 as the normal force."""
-    step = build_and_solve(in_space(), elliptic())()
+    step = make_solve(in_space(), elliptic())()
     # The residual is at most 1e-9 of the forces.
     assert step.contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
 
@@ -149,15 +157,15 @@ def test_elliptic_friction_is_solved():
 def test_axis_of_the_ellipse_out_of_range(name, value):
     """Both coefficients of an ellipse must be positive, as a number, a constant or UFL."""
     scene = in_space()
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: scene.contact(elliptic(**{name: value})), ValueError, name, "greater than zero"
     )
     constant = fem.Constant(scene.mesh, float(value))
     law = elliptic(**{name: constant})
-    raised_everywhere(lambda: scene.problem(law, scene.rollers()), ValueError, name)
+    assert_raised_on_all_ranks(lambda: scene.problem(law, scene.rollers()), ValueError, name)
     x = ufl.SpatialCoordinate(scene.mesh)
     law = elliptic(**{name: ufl.conditional(ufl.gt(x[0], 0.5), 0.2, constant)})
-    raised_everywhere(lambda: scene.problem(law, scene.rollers()), ValueError, name)
+    assert_raised_on_all_ranks(lambda: scene.problem(law, scene.rollers()), ValueError, name)
 
 
 @pytest.mark.whole
@@ -174,7 +182,9 @@ def test_direction_of_friction_by_number(value, words):
     """`Contact` refuses a direction of length zero, of the wrong shape, or not finite."""
     scene = in_space()
     law = elliptic(direction=value)
-    raised_everywhere(lambda: scene.contact(law), ValueError, "contact", "direction", *words)
+    assert_raised_on_all_ranks(
+        lambda: scene.contact(law), ValueError, "contact", "direction", *words
+    )
 
 
 def test_direction_of_friction_parallel_to_the_normal():
@@ -188,19 +198,21 @@ def test_direction_of_friction_parallel_to_the_normal():
         elliptic(direction=(0, 0, 2.0)),
         fc.Tresca(0.3, 1.0, k_n=1e4, k_t=1e3, modes=4, direction=(0, 0, -1)),
     ):
-        raised_everywhere(lambda law=law: scene.problem(law, scene.rollers()), ValueError, *words)
+        assert_raised_on_all_ranks(
+            lambda law=law: scene.problem(law, scene.rollers()), ValueError, *words
+        )
     x = ufl.SpatialCoordinate(scene.mesh)
     somewhere = ufl.as_vector([ufl.conditional(ufl.gt(x[0], 0.5), 1.0, 0.0), 0.0, 1.0])
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: scene.problem(elliptic(direction=somewhere), scene.rollers()), ValueError, *words
     )
     problem, contact = scene.problem(elliptic(), scene.rollers())
     problem.solve()
     for value in ((0, 0, 1.0), (0, 0, 0)):
         contact.parameters["direction"].value = value
-        raised_everywhere(problem.solve, ValueError, *words)
+        assert_raised_on_all_ranks(problem.solve, ValueError, *words)
     contact.parameters["direction"].value = (np.nan, 0, 0)
-    raised_everywhere(problem.solve, ValueError, "direction", "finite")
+    assert_raised_on_all_ranks(problem.solve, ValueError, "direction", "finite")
 
 
 @pytest.mark.whole
@@ -210,19 +222,19 @@ def test_direction_of_friction_parallel_to_the_normal():
 )
 def test_foundation_out_of_range(name, value):
     """A foundation needs k_n, k_t ≥ 0; `Contact` checks numbers, `ContactProblem` constants."""
-    scene = pressed()
+    scene = pressed_block()
     numbers = {"k_n": 1e3, "k_t": 1e2}
     law = fc.Foundation(**numbers | {name: value})
-    raised_everywhere(lambda: scene.contact(law), ValueError, "contact", name)
+    assert_raised_on_all_ranks(lambda: scene.contact(law), ValueError, "contact", name)
     law = fc.Foundation(**numbers | {name: fem.Constant(scene.mesh, float(value))})
-    raised_everywhere(lambda: scene.problem(law, scene.rollers()), ValueError, name)
+    assert_raised_on_all_ranks(lambda: scene.problem(law, scene.rollers()), ValueError, name)
 
 
 def test_foundation_with_constant_zero_tangential_stiffness():
     """A constant k_t = 0 is valid and equivalent to the number zero."""
-    scene = pressed()
+    scene = pressed_block()
     law = fc.Foundation(1e3, fem.Constant(scene.mesh, 0.0))
-    step = build_and_solve(scene, law)()
+    step = make_solve(scene, law)()
     assert step.contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
     assert step.contacts["contact"].tangential_force == 0.0
 
@@ -230,17 +242,17 @@ def test_foundation_with_constant_zero_tangential_stiffness():
 @pytest.mark.parametrize("pressure", [-1.0, np.nan])
 def test_tresca_pressure_out_of_range(pressure):
     """The pressure of Tresca's law must be nonnegative and finite."""
-    scene = pressed()
+    scene = pressed_block()
     law = fc.Tresca(0.3, pressure, k_n=1e4, k_t=1e3)
-    raised_everywhere(lambda: scene.contact(law), ValueError, "pressure")
+    assert_raised_on_all_ranks(lambda: scene.contact(law), ValueError, "pressure")
 
 
 @pytest.mark.whole
 @pytest.mark.parametrize("value", ["rough", "0.3", True, 0.3 + 1j, {}, ["a", "b"], [[1.0], 2.0]])
 def test_parameter_of_a_wrong_type(value):
     """A value that cannot be a coefficient raises a TypeError that names the parameter."""
-    scene = pressed()
-    raised_everywhere(lambda: scene.contact(coulomb(value)), TypeError, "friction")
+    scene = pressed_block()
+    assert_raised_on_all_ranks(lambda: scene.contact(coulomb_law(value)), TypeError, "friction")
 
 
 def test_large_integer_parameters():
@@ -249,30 +261,38 @@ def test_large_integer_parameters():
     _, contact = scene.problem(fc.Frictionless(k_n=10**30), scene.rollers())
     assert contact.parameters["k_n"].value == 1e30
     words = "k_n is 1000"
-    raised_everywhere(lambda: scene.contact(fc.Frictionless(k_n=10**400)), TypeError, words)
+    assert_raised_on_all_ranks(
+        lambda: scene.contact(fc.Frictionless(k_n=10**400)), TypeError, words
+    )
 
 
 def test_parameter_none():
     """A friction coefficient of None is refused."""
-    scene = pressed()
-    raised_everywhere(
-        lambda: scene.problem(coulomb(None), scene.rollers()), (ValueError, TypeError), "friction"
+    scene = pressed_block()
+    assert_raised_on_all_ranks(
+        lambda: scene.problem(coulomb_law(None), scene.rollers()),
+        (ValueError, TypeError),
+        "friction",
     )
 
 
 def test_parameter_of_a_wrong_shape():
     """A friction coefficient that is a vector is refused."""
-    scene = pressed()
-    raised_everywhere(lambda: scene.contact(coulomb((0.1, 0.2))), ValueError, "friction", "scalar")
+    scene = pressed_block()
+    assert_raised_on_all_ranks(
+        lambda: scene.contact(coulomb_law((0.1, 0.2))), ValueError, "friction", "scalar"
+    )
     x = ufl.SpatialCoordinate(scene.mesh)
-    raised_everywhere(lambda: scene.contact(coulomb(x)), ValueError, "friction", "scalar")
+    assert_raised_on_all_ranks(
+        lambda: scene.contact(coulomb_law(x)), ValueError, "friction", "scalar"
+    )
 
 
 @pytest.mark.whole
 @pytest.mark.parametrize("factor", [0.0, -1.0, np.nan, np.inf, "10"])
 def test_scaled_factor_out_of_range(factor):
     """The factor of `RelativeStiffness` must be a positive finite number."""
-    raised_everywhere(lambda: fc.RelativeStiffness(factor), ValueError, "factor")
+    assert_raised_on_all_ranks(lambda: fc.RelativeStiffness(factor), ValueError, "factor")
 
 
 # ---- gap, normal, weight, modulus ----------------------------------------------------------------
@@ -283,24 +303,26 @@ def test_scaled_factor_out_of_range(factor):
 @pytest.mark.parametrize("name", ["gap", "weight"])
 def test_gap_or_weight_not_finite(name, kind):
     """NaN in the prescribed gap or in the weight is refused."""
-    scene = pressed()
+    scene = pressed_block()
     x = ufl.SpatialCoordinate(scene.mesh)
     value = {
         "number": np.nan,
         "constant": fem.Constant(scene.mesh, np.nan),
         "ufl": ufl.sqrt(x[0] - 0.5),
     }[kind]
-    raised_everywhere(
-        lambda: scene.problem(coulomb(), scene.rollers(), contact={name: value}), ValueError, name
+    assert_raised_on_all_ranks(
+        lambda: scene.problem(coulomb_law(), scene.rollers(), contact={name: value}),
+        ValueError,
+        name,
     )
 
 
 def test_negative_weight():
     """A weight that is negative at some points is refused."""
-    scene = pressed()
+    scene = pressed_block()
     weight = ufl.SpatialCoordinate(scene.mesh)[0] - 0.5
-    raised_everywhere(
-        lambda: scene.problem(coulomb(), scene.rollers(), contact={"weight": weight}),
+    assert_raised_on_all_ranks(
+        lambda: scene.problem(coulomb_law(), scene.rollers(), contact={"weight": weight}),
         ValueError,
         "weight",
     )
@@ -309,14 +331,14 @@ def test_negative_weight():
 @pytest.mark.parametrize("kind", ["number", "constant", "ufl"])
 def test_weight_of_zero_at_every_point(kind):
     """A weight of zero at every point, which would transmit no contact force, is refused."""
-    scene = pressed()
+    scene = pressed_block()
     weight = {
         "number": 0.0,
         "constant": fem.Constant(scene.mesh, 0.0),
         "ufl": ufl.SpatialCoordinate(scene.mesh)[1],  # the height of the bottom
     }[kind]
-    raised_everywhere(
-        lambda: scene.problem(coulomb(), scene.rollers(), contact={"weight": weight}),
+    assert_raised_on_all_ranks(
+        lambda: scene.problem(coulomb_law(), scene.rollers(), contact={"weight": weight}),
         ValueError,
         "weight is zero at every point",
     )
@@ -325,12 +347,12 @@ def test_weight_of_zero_at_every_point(kind):
 @pytest.mark.parametrize("obstacle", ["obstacle", "half-space"])
 def test_normal_of_length_zero_on_half_of_the_surface(obstacle):
     """A UFL normal that vanishes on one half of Γc is refused."""
-    scene = pressed()
+    scene = pressed_block()
     x = ufl.SpatialCoordinate(scene.mesh)
     normal = ufl.as_vector([0, ufl.conditional(ufl.gt(x[0], 0.5), -1.0, 0.0)])
     made = {"obstacle": fc.PrescribedGap(0.0, normal), "half-space": fc.HalfSpace((0, 0), -normal)}
-    raised_everywhere(
-        lambda: scene.problem(coulomb(), scene.rollers(), contact={"obstacle": made[obstacle]}),
+    assert_raised_on_all_ranks(
+        lambda: scene.problem(coulomb_law(), scene.rollers(), contact={"obstacle": made[obstacle]}),
         ValueError,
         "normal",
         "length",
@@ -339,11 +361,11 @@ def test_normal_of_length_zero_on_half_of_the_surface(obstacle):
 
 def test_normal_not_finite():
     """A UFL normal that is NaN at some points is refused."""
-    scene = pressed()
+    scene = pressed_block()
     x = ufl.SpatialCoordinate(scene.mesh)
     obstacle = fc.PrescribedGap(0.0, ufl.as_vector([ufl.sqrt(x[0] - 0.5), -1.0]))
-    raised_everywhere(
-        lambda: scene.problem(coulomb(), scene.rollers(), contact={"obstacle": obstacle}),
+    assert_raised_on_all_ranks(
+        lambda: scene.problem(coulomb_law(), scene.rollers(), contact={"obstacle": obstacle}),
         ValueError,
         "normal",
     )
@@ -351,15 +373,17 @@ def test_normal_not_finite():
 
 def test_gap_of_a_wrong_shape():
     """A prescribed gap that is a vector is refused."""
-    scene = pressed()
-    raised_everywhere(lambda: scene.contact(coulomb(), gap=(0.1, 0.2)), ValueError, "gap")
+    scene = pressed_block()
+    assert_raised_on_all_ranks(
+        lambda: scene.contact(coulomb_law(), gap=(0.1, 0.2)), ValueError, "gap"
+    )
 
 
 def test_weight_of_a_wrong_shape():
     """A weight that is a vector is refused."""
-    scene = pressed()
-    raised_everywhere(
-        lambda: scene.problem(coulomb(), scene.rollers(), contact={"weight": (1.0, 2.0)}),
+    scene = pressed_block()
+    assert_raised_on_all_ranks(
+        lambda: scene.problem(coulomb_law(), scene.rollers(), contact={"weight": (1.0, 2.0)}),
         ValueError,
         "weight",
     )
@@ -367,18 +391,18 @@ def test_weight_of_a_wrong_shape():
 
 def test_missing_modulus():
     """`form` refuses a stiffness relative to E/h without E, and names the remedies."""
-    scene = pressed()
+    scene = pressed_block()
     contact = scene.contact(fc.Coulomb(0.3))
     v = ufl.TestFunction(scene.u.function_space)
-    raised_everywhere(lambda: contact.form(v), ValueError, "modulus", "k_n")
+    assert_raised_on_all_ranks(lambda: contact.form(v), ValueError, "modulus", "k_n")
 
 
 @pytest.mark.whole
 @pytest.mark.parametrize("modulus", [0.0, -1.0, np.nan, np.inf, "E", True])
 def test_modulus_out_of_range(modulus):
     """A modulus must be a positive finite number."""
-    scene = pressed()
-    raised_everywhere(
+    scene = pressed_block()
+    assert_raised_on_all_ranks(
         lambda: scene.contact(fc.Coulomb(0.3), modulus=modulus), ValueError, "modulus"
     )
 
@@ -386,12 +410,12 @@ def test_modulus_out_of_range(modulus):
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
 def test_modulus_function_out_of_range(value):
     """A modulus function that is out of range in one cell at Γc is refused."""
-    scene = pressed()
+    scene = pressed_block()
     modulus = fem.Function(fem.functionspace(scene.mesh, ("DG", 0)))
     modulus.x.array[:] = 1000.0
     centers = modulus.function_space.tabulate_dof_coordinates()
     modulus.x.array[(centers[:, 0] < 0.5) & (centers[:, 1] < 0.25)] = value
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: scene.contact(fc.Coulomb(0.3), modulus=modulus), ValueError, "modulus"
     )
 
@@ -400,7 +424,7 @@ def test_modulus_function_out_of_range(value):
 @pytest.mark.parametrize("what", ["friction", "gap", "weight", "displacement", "normal"])
 def test_data_that_depend_on_the_displacement(what):
     """Data of the contact that depend on the unknown u are refused by name."""
-    scene = pressed()
+    scene = pressed_block()
     part = scene.u.sub(1)  # has the same array as u
     grows = 0.3 + ufl.div(scene.u) ** 2
     contact = {
@@ -410,17 +434,21 @@ def test_data_that_depend_on_the_displacement(what):
         "displacement": {"displacement": ufl.as_vector([0.0, 0.1 * scene.u[1]])},
         "normal": {"obstacle": fc.PrescribedGap(0.0, ufl.as_vector([scene.u[0], -1.0]))},
     }[what]
-    law = coulomb(friction=grows if what == "friction" else 0.3)
-    raised_everywhere(lambda: scene.contact(law, **contact), ValueError, what, "the unknown", "u")
+    law = coulomb_law(friction=grows if what == "friction" else 0.3)
+    assert_raised_on_all_ranks(
+        lambda: scene.contact(law, **contact), ValueError, what, "the unknown", "u"
+    )
 
 
 def test_data_of_another_mesh_or_form():
     """A function on another mesh, or a test function, is refused as friction coefficient."""
-    scene, other = pressed(), pressed()
-    far = coulomb(friction=0.3 + other.u[0] ** 2)
-    raised_everywhere(lambda: scene.contact(far), ValueError, "friction", "another mesh")
+    scene, other = pressed_block(), pressed_block()
+    far = coulomb_law(friction=0.3 + other.u[0] ** 2)
+    assert_raised_on_all_ranks(lambda: scene.contact(far), ValueError, "friction", "another mesh")
     v = ufl.TestFunction(scene.u.function_space)
-    raised_everywhere(lambda: scene.contact(coulomb(friction=v[0])), ValueError, "friction", "test")
+    assert_raised_on_all_ranks(
+        lambda: scene.contact(coulomb_law(friction=v[0])), ValueError, "friction", "test"
+    )
 
 
 DATA = ["friction", "gap", "weight"]
@@ -429,16 +457,18 @@ DATA = ["friction", "gap", "weight"]
 def with_data(scene, what, value):
     """Return a contact with one of its data set to a value."""
     contact = {} if what == "friction" else {what: value}
-    return scene.contact(coulomb(friction=value if what == "friction" else 0.3), **contact)
+    return scene.contact(coulomb_law(friction=value if what == "friction" else 0.3), **contact)
 
 
 @pytest.mark.whole
 @pytest.mark.parametrize("what", DATA)
 def test_data_in_single_precision(what):
     """A constant of np.float32 is refused, as forms are in double precision."""
-    scene = pressed()
+    scene = pressed_block()
     value = fem.Constant(scene.mesh, np.float32(0.3))
-    raised_everywhere(lambda: with_data(scene, what, value), ValueError, what, "float32", "double")
+    assert_raised_on_all_ranks(
+        lambda: with_data(scene, what, value), ValueError, what, "float32", "double"
+    )
 
 
 @pytest.mark.whole
@@ -448,7 +478,7 @@ def test_data_on_quadrature_elements(what):
 
     Values at the points of the contact's own rule give the force of the same number, to 1e-12.
     """
-    scene = pressed()
+    scene = pressed_block()
 
     def at_points(mesh, cell, degree):
         element = basix.ufl.quadrature_element(cell, degree=degree)
@@ -459,7 +489,7 @@ def test_data_on_quadrature_elements(what):
     facets = scene.surface.submesh
     for value in (at_points(scene.mesh, "quadrilateral", 2), at_points(facets, "interval", 4)):
         refused = ValueError, what, "quadrature element", "DG"
-        raised_everywhere(lambda value=value: with_data(scene, what, value), *refused)
+        assert_raised_on_all_ranks(lambda value=value: with_data(scene, what, value), *refused)
     forces = []
     for value in (at_points(facets, "interval", 2), 0.2):
         contact = with_data(scene, what, value)
@@ -467,14 +497,14 @@ def test_data_on_quadrature_elements(what):
         problem.solve()
         forces.append(contact.resultants().force)
         scene.u.x.array[:] = 0.0
-    assert close(*forces, 1e-12)
+    assert is_close(*forces, 1e-12)
 
 
 @pytest.mark.whole
 @pytest.mark.parametrize("what", DATA)
 def test_data_that_cannot_be_compiled(what):
     """An expression that FFCx cannot compile, the area of a facet, is refused by name."""
-    scene = pressed()
+    scene = pressed_block()
     value = 0.1 * ufl.FacetArea(scene.mesh)
     words = what, "cannot be compiled", "FacetArea", "fem.Function"
-    raised_everywhere(lambda: with_data(scene, what, value), ValueError, *words)
+    assert_raised_on_all_ranks(lambda: with_data(scene, what, value), ValueError, *words)

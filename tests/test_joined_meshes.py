@@ -18,8 +18,8 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.blocks import BOTTOM, CELLS, LEFT, TOP, block_mesh, dimension
-from scenes.comparing import raised_everywhere
-from scenes.meshes import mesh_of, one_rank_each
+from scenes.comparison import assert_raised_on_all_ranks
+from scenes.meshes import create_mesh, partition_from_owners
 
 COMM = MPI.COMM_WORLD
 pytestmark = [
@@ -161,12 +161,12 @@ def test_cubic_geometry_keeps_its_volume() -> None:
     """The order of the nodes on edges is kept, so that the volume of each part is the same."""
     nodes = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
     cells = np.array([[0, 1, 2], [3, 2, 1]])
-    serial = mesh_of("triangle", nodes, cells, comm=MPI.COMM_SELF)
+    serial = create_mesh("triangle", nodes, cells, comm=MPI.COMM_SELF)
     places = fem.functionspace(serial, ("Lagrange", 3))
     x = places.tabulate_dof_coordinates()[:, :2]
     bent = x.copy()
     bent[:, 1] *= 1 + 0.3 * x[:, 0] * (1 - x[:, 0] ** 2)  # a cubic top, area 1 + 0.3 / 4
-    mesh = mesh_of("triangle", bent, places.dofmap.list, degree=3)
+    mesh = create_mesh("triangle", bent, places.dofmap.list, degree=3)
     one = volume(mesh)
     joined = fc.join_meshes([mesh, mesh])
     for i in (0, 1):
@@ -187,14 +187,14 @@ def test_values_by_body() -> None:
         (5.0, ["5.0", "dict"]),
         ({0: 5.0, 1: "7"}, ["body 1", "'7'"]),
     ):
-        raised_everywhere(lambda values=values: joined.by_body(values), ValueError, *words)
+        assert_raised_on_all_ranks(lambda values=values: joined.by_body(values), ValueError, *words)
 
 
 def test_cells_are_redistributed_over_the_ranks() -> None:
     """Cells that are all on the last rank are redistributed; ranks without cells are allowed."""
 
     def on_the_last(comm: MPI.Comm, n: int, types: Any, cells: Any) -> Any:
-        return one_rank_each(np.full(cells[0].size // 4, n - 1))
+        return partition_from_owners(np.full(cells[0].size // 4, n - 1))
 
     mesh, sides = block_mesh("quadrilateral", n=6, partitioner=on_the_last)
     joined = fc.join_meshes({"a": (mesh, None, sides), "b": (mesh, None, sides)})
@@ -210,12 +210,14 @@ def test_unknown_bodies_and_tags_are_refused() -> None:
     """The error lists the existing bodies or tags."""
     mesh, sides = block_mesh("triangle")
     joined = fc.join_meshes({"block": (mesh, None, sides)})
-    raised_everywhere(lambda: joined.facet("ball", 1), ValueError, "'ball'", "['block']")
-    raised_everywhere(lambda: joined.facet("block", 9), ValueError, "tag 9", "[1, 2, 3, 4]")
+    assert_raised_on_all_ranks(lambda: joined.facet("ball", 1), ValueError, "'ball'", "['block']")
+    assert_raised_on_all_ranks(
+        lambda: joined.facet("block", 9), ValueError, "tag 9", "[1, 2, 3, 4]"
+    )
     several: Any = [1, 2]
-    raised_everywhere(lambda: joined.facet("block", several), ValueError, "tag [1, 2]")
-    raised_everywhere(lambda: joined.cell("block", 1), ValueError, "cell", "tag 1", "[]")
-    raised_everywhere(lambda: joined.body(0), ValueError, "body 0", "['block']")
+    assert_raised_on_all_ranks(lambda: joined.facet("block", several), ValueError, "tag [1, 2]")
+    assert_raised_on_all_ranks(lambda: joined.cell("block", 1), ValueError, "cell", "tag 1", "[]")
+    assert_raised_on_all_ranks(lambda: joined.body(0), ValueError, "body 0", "['block']")
 
 
 def quadratic(cell: str) -> dolfinx.mesh.Mesh:
@@ -235,7 +237,9 @@ def quadratic(cell: str) -> dolfinx.mesh.Mesh:
 def test_incompatible_meshes_are_refused(other: Any, words: list[str]) -> None:
     """The error names both meshes and their difference."""
     parts = {"upper": block_mesh("triangle")[0], "lower": other()}
-    raised_everywhere(lambda: fc.join_meshes(parts), ValueError, "'upper'", "'lower'", *words)
+    assert_raised_on_all_ranks(
+        lambda: fc.join_meshes(parts), ValueError, "'upper'", "'lower'", *words
+    )
 
 
 @pytest.mark.skipif(COMM.size == 1, reason="one rank is all ranks")
@@ -244,7 +248,7 @@ def test_meshes_of_another_communicator_are_refused() -> None:
     own = dolfinx.mesh.create_unit_square(MPI.COMM_SELF, 1, 1, CellType.triangle)
     parts = [block_mesh("triangle")[0], own]
     words = f"{COMM.size} ranks", "on 1", "communicator"
-    raised_everywhere(lambda: fc.join_meshes(parts), ValueError, *words)
+    assert_raised_on_all_ranks(lambda: fc.join_meshes(parts), ValueError, *words)
 
 
 def test_wrong_parts_are_refused() -> None:
@@ -267,7 +271,7 @@ def test_wrong_parts_are_refused() -> None:
         ([(mesh, None, 4)], ["facet_tags of body 0", "int"]),
         ([(mesh, halves)], ["float64", "integers"]),
     ):
-        raised_everywhere(lambda parts=parts: fc.join_meshes(parts), ValueError, *words)
+        assert_raised_on_all_ranks(lambda parts=parts: fc.join_meshes(parts), ValueError, *words)
     with pytest.raises(ValueError, match=r"facet_tags of body 0 have the index .* of this mesh"):
         fc.join_meshes([(mesh, None, far)])
 
@@ -275,7 +279,7 @@ def test_wrong_parts_are_refused() -> None:
 def test_meshes_with_different_node_variants_are_refused() -> None:
     """Nodes of degree 3 depend on the variant: the meshes are refused, the nodes not moved."""
     x, cells = np.array([[0.0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]])
-    serial = mesh_of("triangle", x, cells, comm=MPI.COMM_SELF)
+    serial = create_mesh("triangle", x, cells, comm=MPI.COMM_SELF)
     made = []
     for variant in (basix.LagrangeVariant.gll_warped, basix.LagrangeVariant.equispaced):
         element = basix.ufl.element("Lagrange", "triangle", 3, lagrange_variant=variant)
@@ -289,4 +293,4 @@ def test_meshes_with_different_node_variants_are_refused() -> None:
                 COMM, cells=list_.astype(np.int64), x=nodes, e=ufl.Mesh(vector)
             )
         )
-    raised_everywhere(lambda: fc.join_meshes(made), ValueError, "gll_warped", "equispaced")
+    assert_raised_on_all_ranks(lambda: fc.join_meshes(made), ValueError, "gll_warped", "equispaced")

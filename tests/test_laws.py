@@ -11,16 +11,16 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from scenes.blocks import BOTTOM, CELLS, GRID, RIGHT, block_mesh, dimension, polynomial, wave
-from scenes.comparing import (
+from scenes.blocks import BOTTOM, CELLS, GRID, RIGHT, block_mesh, dimension, polynomial, rough_field
+from scenes.comparison import (
     assemble_matrix,
-    assemble_number,
     assemble_owned,
-    close,
-    compiled,
-    gathered,
-    owned,
-    raised_everywhere,
+    assemble_scalar,
+    assert_raised_on_all_ranks,
+    compile_with_maps,
+    gather,
+    is_close,
+    owned_values,
     set_owned,
 )
 from scenes.elasticity import displacement_space
@@ -91,7 +91,7 @@ class Scene:
         obstacle = fc.PrescribedGap(0.1 + 0.04 * x[0], NORMAL[self.d])
         self.contact = fc.Contact(self.u, surface, obstacle, law)
 
-    def displace(self, normal: float, tangential: float, seed: int) -> None:
+    def set_displacement(self, normal: float, tangential: float, seed: int) -> None:
         """Set u to mean normal and tangential displacements plus a small polynomial."""
         n = NORMAL[self.d] / np.linalg.norm(NORMAL[self.d])
         t = np.linalg.svd(n[None])[2][1]
@@ -104,22 +104,22 @@ class Scene:
         """Bring every point into the given state, and check it."""
         self.contact.history.function.x.array[:] = 0.0
         if state.committed is not None:
-            self.displace(*state.committed, seed=1)
+            self.set_displacement(*state.committed, seed=1)
             self.contact.commit()
-        self.displace(state.normal, state.tangential, seed=2)
+        self.set_displacement(state.normal, state.tangential, seed=2)
         self.contact.evaluate()
         contact = self.contact
         kind = state.name.split()[0]
-        opened = gathered(COMM, contact.gap > 0)
+        opened = gather(COMM, contact.gap > 0)
         assert np.all(opened) if kind == "open" else not np.any(opened)
         if contact.law.has_friction and kind != "open":
-            slips = gathered(COMM, np.any(contact.slip_increment > 0, axis=1))
+            slips = gather(COMM, np.any(contact.slip_increment > 0, axis=1))
             assert np.all(slips) if kind == "slip" else not np.any(slips)
 
 
 def central(scene: Scene, direction: np.ndarray, evaluate, h: float = 1e-5):
     """Return the central difference of ``evaluate()`` at u along a direction."""
-    at = owned(scene.u).copy()
+    at = owned_values(scene.u).copy()
     ends = []
     for sign in (1, -1):
         set_owned(scene.u, at + sign * h * direction)
@@ -132,8 +132,8 @@ def directions(scene: Scene) -> list[np.ndarray]:
     found = []
     for seed in (11, 12):
         f = fem.Function(scene.space)
-        f.interpolate(wave(scene.d, seed))
-        found.append(owned(f).copy())
+        f.interpolate(rough_field(scene.d, seed))
+        found.append(owned_values(f).copy())
     return found
 
 
@@ -156,16 +156,16 @@ def test_residual_and_tangent_are_derivatives(cell, degree, law):
     scene = Scene(cell, degree, ALL_LAWS[law])
     contact, space = scene.contact, scene.space
     v, du = ufl.TestFunction(space), ufl.TrialFunction(space)
-    residual = compiled(contact.form(v), contact)
-    tangent_form = compiled(contact.tangent(v, du), contact)
+    residual = compile_with_maps(contact.form(v), contact)
+    tangent_form = compile_with_maps(contact.tangent(v, du), contact)
     potential = None
     kind = type(contact.law).__name__
     path_dependent = law.startswith(("coulomb", "compliance")) or law == "foundation, closed only"
     assert contact.law.has_potential is not path_dependent
     if not contact.law.has_potential:
-        raised_everywhere(contact.potential, ValueError, kind, "potential")
+        assert_raised_on_all_ranks(contact.potential, ValueError, kind, "potential")
     else:
-        potential = compiled(contact.potential(), contact)
+        potential = compile_with_maps(contact.potential(), contact)
     for state in STATES:
         scene.enter(state)
         tangent = assemble_matrix(tangent_form)
@@ -173,7 +173,7 @@ def test_residual_and_tangent_are_derivatives(cell, degree, law):
         x, y = tangent.createVecs()
         for direction in directions(scene):
             if potential is not None:
-                difference = central(scene, direction, lambda: assemble_number(potential, COMM))
+                difference = central(scene, direction, lambda: assemble_scalar(potential, COMM))
                 exact = COMM.allreduce(float(r @ direction))
                 # Relative to the sum of the magnitudes of all terms of the work.
                 size = COMM.allreduce(float(np.abs(r * direction).sum()))
@@ -181,10 +181,12 @@ def test_residual_and_tangent_are_derivatives(cell, degree, law):
             x.array[:] = direction
             tangent.mult(x, y)
             difference = central(scene, direction, lambda: assemble_owned(residual, space))
-            difference, exact = gathered(COMM, difference), gathered(COMM, y.array)
+            difference, exact = gather(COMM, difference), gather(COMM, y.array)
             # Where the tangent vanishes, the round-off of the residual divided by h remains.
-            assert close(difference, exact, 1e-6, scale=max(np.abs(exact).max(), 1e-4)), state.name
-        check_shape(scene, state, law, gathered(COMM, r), tangent)
+            assert is_close(difference, exact, 1e-6, scale=max(np.abs(exact).max(), 1e-4)), (
+                state.name
+            )
+        check_shape(scene, state, law, gather(COMM, r), tangent)
         for thing in (tangent, x, y):
             thing.destroy()
 
@@ -227,9 +229,9 @@ def test_full_contact_springs_equal_the_sticking_tangent(cell, law):
     """
     scene = Scene(cell, 1, ALL_LAWS[law])
     scene.enter(STATES[1])
-    assert set(gathered(COMM, scene.contact.status).tolist()) == {fc.Status.STICK}
+    assert set(gather(COMM, scene.contact.status).tolist()) == {fc.Status.STICK}
     v, du = ufl.TestFunction(scene.space), ufl.TrialFunction(scene.space)
-    tangent = assemble_matrix(compiled(scene.contact.tangent(v, du), scene.contact))
+    tangent = assemble_matrix(compile_with_maps(scene.contact.tangent(v, du), scene.contact))
     scene.contact.evaluate()
     stiffness = fc.ContactOperator(scene.contact).springs(scene.contact.values.springs(1.0, 1.0))
     size = tangent.norm()
@@ -244,7 +246,7 @@ def test_full_contact_springs_equal_the_sticking_tangent(cell, law):
 
 def traction_by_hand(scene: Scene, mu, k_n, k_t) -> np.ndarray:
     """Return the tractions of a return map without history, in numpy, at all points."""
-    x = gathered(COMM, scene.contact.points)
+    x = gather(COMM, scene.contact.points)
     field = polynomial(scene.d, scene.degree, 2, 0.002)
     n = NORMAL[scene.d] / np.linalg.norm(NORMAL[scene.d])
     t = np.linalg.svd(n[None])[2][1]
@@ -269,7 +271,7 @@ def test_parameters_vary_over_the_surface(cell):
     law = fc.Coulomb(0.2 + 0.3 * x[0] ** 2, k_n=80 + 40 * x[1], k_t=ufl.exp(4 + x[0] * x[1]))
     surface, obstacle = scene.contact.surface, scene.contact.obstacle
     scene.contact = fc.Contact(scene.u, surface, obstacle, law)
-    scene.displace(0.2, 0.03, seed=2)
+    scene.set_displacement(0.2, 0.03, seed=2)
     scene.contact.evaluate()
     expected = traction_by_hand(
         scene,
@@ -277,9 +279,9 @@ def test_parameters_vary_over_the_surface(cell):
         lambda x: 80 + 40 * x[:, 1],
         lambda x: np.exp(4 + x[:, 0] * x[:, 1]),
     )
-    status = set(gathered(COMM, scene.contact.status).tolist())
+    status = set(gather(COMM, scene.contact.status).tolist())
     assert status == {fc.Status.STICK, fc.Status.SLIP}
-    assert close(gathered(COMM, scene.contact.traction), expected, 1e-12)
+    assert is_close(gather(COMM, scene.contact.traction), expected, 1e-12)
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
@@ -292,8 +294,8 @@ def test_parameters_change_without_compiling(cell, monkeypatch):
     contact, space = scene.contact, scene.space
     assert {"friction", "k_n", "k_t"} <= set(contact.parameters)
     v, du = ufl.TestFunction(space), ufl.TrialFunction(space)
-    form = compiled(contact.form(v), contact)
-    tangent = compiled(contact.tangent(v, du), contact)
+    form = compile_with_maps(contact.form(v), contact)
+    tangent = compile_with_maps(contact.tangent(v, du), contact)
 
     def refuse(*args, **kwargs):
         raise AssertionError("a form was compiled")
@@ -302,7 +304,7 @@ def test_parameters_change_without_compiling(cell, monkeypatch):
     # The guard works: compiling a new form fails.
     with pytest.raises(AssertionError, match="compiled"):
         fem.form(contact.form(v), entity_maps=contact.entity_maps)
-    scene.displace(0.2, 0.03, seed=2)
+    scene.set_displacement(0.2, 0.03, seed=2)
     sizes = []
     for mu, k_n, k_t in ((FRICTION, K_N, K_T), (0.1, 2 * K_N, 3 * K_T), (0.0, 50.0, 40.0)):
         for name, value in zip(("friction", "k_n", "k_t"), (mu, k_n, k_t), strict=True):
@@ -314,11 +316,11 @@ def test_parameters_change_without_compiling(cell, monkeypatch):
             lambda x, k_n=k_n: np.full(len(x), k_n),
             lambda x, k_t=k_t: np.full(len(x), k_t),
         )
-        assert close(gathered(COMM, contact.traction), expected, 1e-12)
+        assert is_close(gather(COMM, contact.traction), expected, 1e-12)
         # The assembled form sums minus the traction over Γc.
-        measure = gathered(COMM, contact.measure)
+        measure = gather(COMM, contact.measure)
         force = COMM.allreduce(assemble_owned(form, space).reshape(-1, scene.d).sum(axis=0))
-        assert close(-force, measure @ expected, 1e-12)
+        assert is_close(-force, measure @ expected, 1e-12)
         matrix = assemble_matrix(tangent)
         sizes.append(matrix.norm())
         matrix.destroy()
@@ -338,21 +340,21 @@ def test_weight_multiplies_the_form_and_the_resultants(cell):
             plain.u, plain.contact.surface, plain.contact.obstacle, LAWS["tresca"], weight=2.5
         )
     )
-    plain.displace(0.2, 0.3, seed=2)
+    plain.set_displacement(0.2, 0.3, seed=2)
     v = ufl.TestFunction(plain.space)
     forces, energies, tractions, resultants = [], [], [], []
     for contact in contacts:
         contact.evaluate()
         forces.append(
-            gathered(COMM, assemble_owned(compiled(contact.form(v), contact), plain.space))
+            gather(COMM, assemble_owned(compile_with_maps(contact.form(v), contact), plain.space))
         )
-        energies.append(assemble_number(compiled(contact.potential(), contact), COMM))
-        tractions.append(gathered(COMM, contact.traction))
+        energies.append(assemble_scalar(compile_with_maps(contact.potential(), contact), COMM))
+        tractions.append(gather(COMM, contact.traction))
         resultants.append(contact.resultants())
-    assert close(forces[1], 2.5 * forces[0], 1e-13)
+    assert is_close(forces[1], 2.5 * forces[0], 1e-13)
     assert abs(energies[1] - 2.5 * energies[0]) <= 1e-13 * energies[1]
-    assert close(tractions[1], tractions[0], 1e-13)
-    assert close(resultants[1].force, 2.5 * resultants[0].force, 1e-13)
+    assert is_close(tractions[1], tractions[0], 1e-13)
+    assert is_close(resultants[1].force, 2.5 * resultants[0].force, 1e-13)
     assert resultants[1].normal_force == pytest.approx(2.5 * resultants[0].normal_force, rel=1e-13)
     assert resultants[1].max_pressure == pytest.approx(resultants[0].max_pressure, rel=1e-13)
 
@@ -372,8 +374,8 @@ def test_scaled_stiffness_is_a_multiple_of_modulus_over_height(cell):
     contact = fc.Contact(u, surface, fc.HalfSpace(0 * up, up), law, modulus=210.0)
     u.interpolate(lambda x: np.outer(-0.01 * up, np.ones(x.shape[1])))
     contact.evaluate()
-    pressure = gathered(COMM, contact.pressure)
-    assert close(pressure, np.full(len(pressure), 3.0 * 210.0 * 3 * 0.01), 1e-9)
+    pressure = gather(COMM, contact.pressure)
+    assert is_close(pressure, np.full(len(pressure), 3.0 * 210.0 * 3 * 0.01), 1e-9)
     contact.parameters["k_n"].value = 6.0  # the factor
     contact.evaluate()
-    assert close(gathered(COMM, contact.pressure), 2 * pressure, 1e-9)
+    assert is_close(gather(COMM, contact.pressure), 2 * pressure, 1e-9)

@@ -13,7 +13,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from scenes.comparing import raised_everywhere
+from scenes.comparison import assert_raised_on_all_ranks
 
 COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
@@ -88,7 +88,7 @@ def test_rank_without_a_model_is_refused(model: Any) -> None:
         model.mesh.generate(2)
     wrong = COMM.size - 1
     if wrong:
-        raised_everywhere(
+        assert_raised_on_all_ranks(
             lambda: fc.model_to_mesh(model, COMM, wrong, 2), ValueError, "addPhysicalGroup(2"
         )
 
@@ -97,7 +97,9 @@ def test_invalid_models_are_refused(model: Any) -> None:
     """Invalid models are refused on all ranks, before the mesh is created."""
 
     def refused(*words: str) -> None:
-        raised_everywhere(lambda: fc.model_to_mesh(model, COMM, gdim=2), ValueError, *words)
+        assert_raised_on_all_ranks(
+            lambda: fc.model_to_mesh(model, COMM, gdim=2), ValueError, *words
+        )
 
     refused("dimensions []", "addPhysicalGroup(2")
     if COMM.rank == 0:
@@ -232,7 +234,7 @@ def test_arrays_of_every_cell_type(kind: str, order: int) -> None:
     assert measure(x[1] ** 2 * ds(LEFT)) == pytest.approx(1 / 3)
     assert measure(x[0] * ds(LEFT)) == pytest.approx(0.0, abs=1e-12)
     if order == 2 or kind in ("quadrilateral", "hexahedron"):
-        raised_everywhere(
+        assert_raised_on_all_ranks(
             lambda: fc.mesh_from_arrays(COMM, points, cells, cell_type=kind, node_order="dolfinx"),
             ValueError,
             "node_order='dolfinx'",
@@ -256,7 +258,7 @@ def test_invalid_arrays_are_refused() -> None:
     """Invalid arrays are refused on all ranks; the error says what was given and what to give."""
 
     def refused(*words: str, **changes: Any) -> None:
-        raised_everywhere(lambda: from_arrays(**changes), ValueError, *words)
+        assert_raised_on_all_ranks(lambda: from_arrays(**changes), ValueError, *words)
 
     points, cells = SQUARES["points"], np.array(SQUARES["cells"])
     refused("'prism'", "quadrilateral", cell_type="prism")
@@ -282,7 +284,7 @@ def test_invalid_arrays_are_refused() -> None:
     refused("facets[5]", "0 to 8", facets={BOTTOM: [[0, 8]]})
     refused("facets[5] has 1 facets", "[[0, 4]]", facets={BOTTOM: [[0, 1], [4, 0]]})
     refused("two tags", "[0, 1]", "[5, 6]", facets={BOTTOM: [[0, 1]], TOP: [[1, 0]]})
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: fc.mesh_from_arrays(COMM, points, cells, cell_type="quadrilateral", rank=99),
         ValueError,
         "rank is 99",

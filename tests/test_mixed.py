@@ -13,28 +13,28 @@ from fenics_contact import compat
 from fenics_contact.compiling import compile_form
 from fenics_contact.elasticity import NeoHookean
 from fenics_contact.parallel import global_max
-from scenes.blocks import BOTTOM, TOP, wave
-from scenes.comparing import (
+from scenes.blocks import BOTTOM, TOP, rough_field
+from scenes.comparison import (
     assemble_matrix,
     assemble_owned,
-    at_points,
-    close,
-    compiled,
-    owned,
+    compile_with_maps,
+    is_close,
+    owned_values,
+    point_values,
     set_owned,
     shared_folder,
 )
-from scenes.histories import goes_on
-from scenes.rubber import MIXED, TIGHT, Tool, disc, rubber, split
+from scenes.histories import assert_restart_equals_uninterrupted
+from scenes.rubber import MIXED, TIGHT_TOLERANCE, DiscOnRubber, disc, rubber, split
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(300)]
 
 # Nearly incompressible, incompressible, then linear at small strains.
-HOW = {
+VARIANTS = {
     "Taylor-Hood": {"mixed": "Taylor-Hood", "nu": 0.4999},
     "MINI": {"mixed": "MINI", "nu": 0.5},
     "isochoric": {"mixed": "Taylor-Hood", "nu": 0.5, "isochoric": True},
-    "by force": {"mixed": "Taylor-Hood", "nu": 0.5, "force": True},
+    "by force": {"mixed": "Taylor-Hood", "nu": 0.5, "by_force": True},
     "augmented": {"mixed": "MINI", "nu": 0.4999, "contact": {"enforcement": "augmented"}},
     "linear": {
         "mixed": "Taylor-Hood",
@@ -45,26 +45,30 @@ HOW = {
 }
 
 
-def tool(how: str, cell: str = "triangle", **options) -> Tool:
+def tool(variant: str, cell: str = "triangle", **options) -> DiscOnRubber:
     """Return a coarse block under a disc that presses, drags and rotates."""
     n = {"n": (8, 4)} if cell == "triangle" else {"n": (3, 2)}
-    return Tool(cell, **n, **HOW[how], **options)
+    return DiscOnRubber(cell, **n, **VARIANTS[variant], **options)
 
 
 # ---- whole histories -----------------------------------------------------------------------------
 
 
 @pytest.mark.each
-@pytest.mark.parametrize("how", HOW)
-def test_history_is_verified_and_balances(how):
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_history_is_verified_and_balances(variant):
     """All verdicts of a tool pressed, dragged, moved back and rotated pass, with cross-checks.
 
     The reactions of the bottom, assembled here, balance the contact force to 1e-10.
     """
-    solver = {"cross_check": True} | HOW[how].get("solver", {})
-    made = Tool("triangle", n=(8, 4), **{**HOW[how], "solver": {"petsc_options": TIGHT, **solver}})
+    solver = {"cross_check": True} | VARIANTS[variant].get("solver", {})
+    made = DiscOnRubber(
+        "triangle",
+        n=(8, 4),
+        **{**VARIANTS[variant], "solver": {"petsc_options": TIGHT_TOLERANCE, **solver}},
+    )
     scene, problem = made.scene, made.problem
-    form, part = compiled(scene.F), problem.displacement
+    form, part = compile_with_maps(scene.F), problem.displacement
     held = fem.Function(part.u.function_space)
     for step in made.increments():
         assert not step.verdict.failures and step.verdict.cross_check
@@ -74,36 +78,36 @@ def test_history_is_verified_and_balances(how):
         for i in range(scene.dim):
             held.x.array[:] = 0.0
             held.x.array[i :: scene.dim] = 1.0
-            reaction[i] = scene.mesh.comm.allreduce(part.within(owned(held)) @ forces)
-        assert close(-reaction, made.resultant(), 1e-10)
+            reaction[i] = scene.mesh.comm.allreduce(part.within(owned_values(held)) @ forces)
+        assert is_close(-reaction, made.resultant(), 1e-10)
     assert np.abs(made.resultant()).min() > 0.1
 
 
 @pytest.mark.each
-@pytest.mark.parametrize("how", ["Taylor-Hood", "MINI", "by force", "augmented", "linear"])
-def test_restart_from_a_checkpoint(how, tmp_path):
+@pytest.mark.parametrize("variant", ["Taylor-Hood", "MINI", "by force", "augmented", "linear"])
+def test_restart_from_a_checkpoint(variant, tmp_path):
     """A history restarted while the tool rotates is the same, bitwise on one rank, 1e-7 on more."""
-    goes_on(lambda: tool(how), shared_folder(tmp_path), stop=5)
+    assert_restart_equals_uninterrupted(lambda: tool(variant), shared_folder(tmp_path), stop=5)
 
 
-@pytest.mark.parametrize("how", ["Taylor-Hood", "linear"])
-def test_lbfgs_agrees_with_newton(how):
+@pytest.mark.parametrize("variant", ["Taylor-Hood", "linear"])
+def test_lbfgs_agrees_with_newton(variant):
     """L-BFGS with the factored saddle point as H₀ needs no minimum: tractions of Newton, 1e-7."""
     found = []
     for method in ("newton", "lbfgs"):
-        solver = HOW[how].get("solver", {}) | {"method": method, "fallback": False}
-        made = Tool("triangle", n=(8, 4), **{**HOW[how], "solver": solver})
+        solver = VARIANTS[variant].get("solver", {}) | {"method": method, "fallback": False}
+        made = DiscOnRubber("triangle", n=(8, 4), **{**VARIANTS[variant], "solver": solver})
         for step in made.increments(2.0, steps=8, max_cuts=0):
             assert step.method == method
         found.append(made.tractions())
     assert np.abs(found[0]).max() > 10.0
-    assert close(found[1], found[0], 1e-7)
+    assert is_close(found[1], found[0], 1e-7)
 
 
 def test_tetrahedra_are_verified():
     """Verdicts pass for incompressible tetrahedra pressed and dragged with friction."""
-    for how in ("Taylor-Hood", "MINI"):
-        made = tool(how, "tetrahedron")
+    for variant in ("Taylor-Hood", "MINI"):
+        made = tool(variant, "tetrahedron")
         for step in made.increments(1.5):
             assert not step.verdict.failures
         assert made.resultant()[-1] < -1.0
@@ -116,7 +120,7 @@ def test_first_touch_with_cut_increments():
     """
     ends = []
     for steps in (1, 10):
-        made = Tool("triangle", n=(8, 4), law=fc.Frictionless(1e4), **HOW["MINI"])
+        made = DiscOnRubber("triangle", n=(8, 4), law=fc.Frictionless(1e4), **VARIANTS["MINI"])
 
         def load(t, made=made):
             made.shift.value[:] = made.vector(0.1, 0.5 - 0.8 * t)
@@ -125,7 +129,7 @@ def test_first_touch_with_cut_increments():
         assert last.increment >= steps
         ends.append(made.tractions())
     assert np.abs(ends[1]).max() > 100.0
-    assert close(ends[0], ends[1], 1e-7)
+    assert is_close(ends[0], ends[1], 1e-7)
 
 
 def test_contact_form_in_a_user_written_block_newton_method():
@@ -152,8 +156,8 @@ def test_contact_form_in_a_user_written_block_newton_method():
     bulk = body.residual(v, q=q)
     residual = bulk + contact.form(v)
     tangent = ufl.derivative(bulk, u, du) + ufl.derivative(bulk, p, dp) + contact.tangent(v, du)
-    forms = [compiled(part, contact) for part in ufl.extract_blocks(residual)]
-    blocks = [[compiled(b, contact) for b in row] for row in ufl.extract_blocks(tangent)]
+    forms = [compile_with_maps(part, contact) for part in ufl.extract_blocks(residual)]
+    blocks = [[compile_with_maps(b, contact) for b in row] for row in ufl.extract_blocks(tangent)]
     dofs = fem.locate_dofs_topological(V, tags.dim, tags.find(BOTTOM))
     held, n_held = fem.dirichletbc(np.zeros(d), dofs, V).dof_indices()
     held = held[:n_held]
@@ -174,17 +178,17 @@ def test_contact_form_in_a_user_written_block_newton_method():
             b.array[:] = np.concatenate([forces, excess])
             solver.setOperators(A)
             solver.solve(b, step)
-            set_owned(u, owned(u) - step.array_r[: forces.size])
-            set_owned(p, owned(p) - step.array_r[forces.size :])
+            set_owned(u, owned_values(u) - step.array_r[: forces.size])
+            set_owned(p, owned_values(p) - step.array_r[forces.size :])
             size = max(size, step.norm())
             if step.norm() < 1e-11 * size:
                 break
         else:
             pytest.fail("Newton's method written here has not converged")
         contact.commit()
-        one.go(side, up)
+        one.solve_increment(side, up)
     assert np.abs(one.tractions()).max() > 10.0
-    assert close(at_points(contact, contact.traction), one.tractions(), 1e-9)
+    assert is_close(point_values(contact, contact.traction), one.tractions(), 1e-9)
 
 
 # ---- single states -------------------------------------------------------------------------------
@@ -204,7 +208,7 @@ def test_tangent_and_boundary_form_of_mixed_functions(name, kinematics):
     operator = fc.ContactOperator(contact)
     start, direction = (fem.Function(W) for _ in range(2))
     for function, seed, size in ((start, 0, 0.03), (direction, 1, 1.0)):
-        function.sub(0).interpolate(lambda x, s=seed, a=size: a * wave(2, s)(x))
+        function.sub(0).interpolate(lambda x, s=seed, a=size: a * rough_field(2, s)(x))
 
     def force(step):
         scene.u.x.array[:] = start.x.array + step * direction.x.array
@@ -221,9 +225,9 @@ def test_tangent_and_boundary_form_of_mixed_functions(name, kinematics):
     assert size > 1.0
     assert global_max(comm, np.abs(product.array_r - difference)) < 1e-6 * size
     v, dw = split(ufl.TestFunctions(W))[0], ufl.TrialFunction(W)
-    assembled = assemble_owned(compiled(contact.form(v), contact), W)
+    assembled = assemble_owned(compile_with_maps(contact.form(v), contact), W)
     assert global_max(comm, np.abs(assembled - forces)) < 1e-11 * global_max(comm, np.abs(forces))
-    theirs = assemble_matrix(compiled(contact.tangent(v, dw), contact))
+    theirs = assemble_matrix(compile_with_maps(contact.tangent(v, dw), contact))
     other = theirs.createVecLeft()
     theirs.mult(direction.x.petsc_vec, other)
     assert global_max(comm, np.abs(other.array_r - product.array_r)) < 1e-11 * size
@@ -232,8 +236,8 @@ def test_tangent_and_boundary_form_of_mixed_functions(name, kinematics):
     assert min(r.open, r.stick, r.slip) > 0
 
 
-@pytest.mark.parametrize("how", ["Taylor-Hood", "linear"])
-def test_units_do_not_matter(how):
+@pytest.mark.parametrize("variant", ["Taylor-Hood", "linear"])
+def test_units_do_not_matter(variant):
     """A block in mm and MPa, and in m and GPa, has the same iterations, and tractions to 1e-9."""
     found = []
     for length, stress in ((1.0, 1.0), (1e-3, 1e-3)):
@@ -242,7 +246,7 @@ def test_units_do_not_matter(how):
             n=(8, 4),
             size=(2.0 * length, length),
             E=1e3 * stress,
-            **{k: v for k, v in HOW[how].items() if k != "solver"},
+            **{k: v for k, v in VARIANTS[variant].items() if k != "solver"},
         )
         shift = fem.Constant(scene.mesh, np.zeros(2))
         law = fc.Coulomb(0.3, 1e4 * stress / length, 1e4 * stress / length)
@@ -250,14 +254,14 @@ def test_units_do_not_matter(how):
             disc(scene, 0.8 * length, displacement=shift), law, small_displacement_tolerance=np.inf
         )
         iterations = []
-        for way in ((0.0, -0.05), (0.02, -0.1), (0.05, -0.1)):
-            shift.value[:] = np.array(way) * length
+        for displacement in ((0.0, -0.05), (0.02, -0.1), (0.05, -0.1)):
+            shift.value[:] = np.array(displacement) * length
             iterations.append(problem.solve().iterations)
             problem.commit()
-        found.append((iterations, at_points(contact, contact.traction) / stress))
+        found.append((iterations, point_values(contact, contact.traction) / stress))
     assert found[0][0] == found[1][0]
     assert np.abs(found[0][1]).max() > 10.0
-    assert close(found[1][1], found[0][1], 1e-9)
+    assert is_close(found[1][1], found[0][1], 1e-9)
 
 
 def test_cells_inverted_by_bubbles_are_detected():
@@ -285,9 +289,9 @@ def test_unit_of_pressure_dofs_scales_their_equations_to_forces():
         for dofs, expected in zip(parts, [1.0, *[1.0] * (len(parts) - 2), 4 * E], strict=True):
             for unit in np.unique(units[dofs]):
                 assert expected / 2.5 <= unit <= 2.5 * expected, (name, expected)
-        owned(scene.u)[:] = 1e-3 * np.cos(np.arange(problem.full.unknowns.n_dofs) ** 2.0)
+        owned_values(scene.u)[:] = 1e-3 * np.cos(np.arange(problem.full.unknowns.n_dofs) ** 2.0)
         scene.u.x.scatter_forward()
-        raw = assemble_owned(compiled(scene.F), scene.u.function_space)
+        raw = assemble_owned(compile_with_maps(scene.F), scene.u.function_space)
         expected = raw * units[: raw.size]
         assert np.abs(problem.full.bulk.assemble_residual() - expected).max(initial=0.0) < 1e-12 * E
 
@@ -309,7 +313,7 @@ def test_contact_stiffness_follows_the_shear_modulus():
         problem, contact = scene.problem(disc(scene, 0.8), fc.Frictionless())
         k_n, h = contact.values.parameters["k_n"], 0.5
         assert problem.full.bulk.displacement.is_mixed
-        assert close(k_n, np.full_like(k_n, 10 * 3 * 1e3 / (2 * (1 + nu)) / h), 1e-9)
+        assert is_close(k_n, np.full_like(k_n, 10 * 3 * 1e3 / (2 * (1 + nu)) / h), 1e-9)
 
 
 def test_problem_without_contacts_finds_its_displacement_field():

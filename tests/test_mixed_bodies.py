@@ -11,11 +11,17 @@ from dolfinx import fem
 
 import fenics_contact as fc
 from fenics_contact.elasticity import NeoHookean
-from scenes.comparing import assemble_owned, close, compiled, owned, shared_folder
+from scenes.comparison import (
+    assemble_owned,
+    compile_with_maps,
+    is_close,
+    owned_values,
+    shared_folder,
+)
 from scenes.elasticity import strain
-from scenes.rubber import MIXED, TIGHT, mixed_space, split
-from scenes.tags import plane, sides
-from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, two_blocks
+from scenes.rubber import MIXED, TIGHT_TOLERANCE, mixed_space, split
+from scenes.tags import plane, tag_by_nodes
+from scenes.two_blocks import BOTTOM, LOWER_FACE, TOP, UPPER_FACE, two_blocks
 
 pytestmark = [
     pytest.mark.newest,
@@ -66,10 +72,10 @@ class Blocks:
         else:
             work = 2 * G * ufl.inner(strain(u), strain(v)) - p * ufl.div(v) - q * ufl.div(u)
             self.F = work * ufl.dx(mesh)
-        self.form = compiled(self.F)
+        self.form = compile_with_maps(self.F)
         self.along, self.down = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
         nothing = fem.Constant(mesh, 0.0)
-        left = sides(mesh, {9: plane(0, 0.0)})
+        left = tag_by_nodes(mesh, {9: plane(0, 0.0)})
         held = [(tags, BOTTOM, 1, nothing), (tags, TOP, 1, self.down)]
         if smooth:
             held += [(left, 9, 0, nothing)]
@@ -82,13 +88,13 @@ class Blocks:
             bcs.append(fem.dirichletbc(value, dofs, part))
         self.contact = fc.Contact(
             u,
-            fc.ContactSurface(mesh, tags, UPPER),
-            fc.DeformableBody(tags, LOWER, update_pairs="never"),
+            fc.ContactSurface(mesh, tags, UPPER_FACE),
+            fc.DeformableBody(tags, LOWER_FACE, update_pairs="never"),
             law,
             kinematics=kinematics,
             **(contact or {}),
         )
-        options = {"petsc_options": TIGHT} | options
+        options = {"petsc_options": TIGHT_TOLERANCE} | options
         if kinematics == "small":  # for comparison with closed forms
             options["small_displacement_tolerance"] = np.inf
         self.problem = fc.ContactProblem(
@@ -109,7 +115,7 @@ class Blocks:
             chosen = fem.Function(part.u.function_space)
             there = np.isclose(part.u.function_space.tabulate_dof_coordinates()[:, 1], height)
             chosen.x.array[i::2] = there
-            found[i] = self.mesh.comm.allreduce(part.within(owned(chosen)) @ forces)
+            found[i] = self.mesh.comm.allreduce(part.within(owned_values(chosen)) @ forces)
         return found
 
 
@@ -144,7 +150,7 @@ def test_uniform_compression(kinematics, mixed, enforcement):
     force = step.contacts["contact"]
     assert force.normal_force == pytest.approx(-nominal, rel=1e-6)
     assert force.slip == 0 and force.tangential_force < 1e-6 * force.normal_force
-    assert close(made.contact.pressure, np.full_like(made.contact.pressure, -nominal), 1e-6)
+    assert is_close(made.contact.pressure, np.full_like(made.contact.pressure, -nominal), 1e-6)
 
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
@@ -166,8 +172,8 @@ def test_dragged_block_slips_at_the_friction_bound(kinematics, enforcement):
     for step in fc.increments(made.problem, made.load, 0, 1, steps=8):
         assert not step.verdict.failures
         force = step.contacts["contact"].force
-        assert close(made.reaction(1.0), -force, 1e-9)
-        assert close(made.reaction(0.0), force, 1e-9)
+        assert is_close(made.reaction(1.0), -force, 1e-9)
+        assert is_close(made.reaction(0.0), force, 1e-9)
     last = step.contacts["contact"]
     assert last.slip > 0 and last.stick == 0
     assert force[0] < 0 < force[1]
@@ -193,5 +199,5 @@ def test_restarted_history_gives_the_same_solution(kinematics, tmp_path):
     for _ in fc.increments(second.problem, second.load, 0, 1, steps=8, checkpoint=file):
         pass
     forces = [each.contact.resultants().force for each in (whole, second)]
-    assert close(forces[1], forces[0], 1e-9)
-    assert close(owned(second.w), owned(whole.w), 1e-9)
+    assert is_close(forces[1], forces[0], 1e-9)
+    assert is_close(owned_values(second.w), owned_values(whole.w), 1e-9)

@@ -8,9 +8,9 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from scenes.block_on_ball import supporting_ball
 from scenes.blocks import BOTTOM, LEFT, TOP, block
-from scenes.comparing import close, gathered, nodal, raised_everywhere
-from scenes.rubbing import cushion
+from scenes.comparison import assert_raised_on_all_ranks, gather, is_close, nodal_values
 
 pytestmark = [pytest.mark.three_ranks, pytest.mark.newest]
 
@@ -20,8 +20,8 @@ COMM = MPI.COMM_WORLD
 def pressed(cell, law, motion, method="lbfgs"):
     scene = block(cell, 1, n=4)
     d = scene.dim
-    bcs = [scene.hold(TOP, i) for i in range(d)]
-    obstacle = cushion(d, motion)
+    bcs = [scene.dirichlet_bc(TOP, i) for i in range(d)]
+    obstacle = supporting_ball(d, motion)
     problem, contact = scene.problem(law, bcs, contact={"obstacle": obstacle}, method=method)
     return scene, problem, contact
 
@@ -42,7 +42,7 @@ def test_given_force_and_given_displacement_have_the_same_state(cell, method):
     scene, problem, contact = pressed(cell, law, motion, method)
     problem.solve()
     problem.commit()
-    assert close(contact.resultants().force[-1], force, 1e-8)
+    assert is_close(contact.resultants().force[-1], force, 1e-8)
     assert contact.resultants().slip > 0
     up = float(contact.free_motion[d - 1].value)
     assert up > 0
@@ -51,8 +51,8 @@ def test_given_force_and_given_displacement_have_the_same_state(cell, method):
     given[0], given[-1] = drag, up
     other, problem, again = pressed(cell, law, given, method)
     problem.solve()
-    assert close(again.resultants().force, contact.resultants().force, 1e-7)
-    assert close(nodal(other.u), nodal(scene.u), 1e-7)
+    assert is_close(again.resultants().force, contact.resultants().force, 1e-7)
+    assert is_close(nodal_values(other.u), nodal_values(scene.u), 1e-7)
 
 
 def test_newton_converges_quadratically_with_a_rotating_normal():
@@ -67,7 +67,7 @@ def test_newton_converges_quadratically_with_a_rotating_normal():
     step = problem.solve()
     # Measured: 1 iteration, and 3 without the derivative of the normal.
     assert step.iterations <= 2
-    assert close(contact.resultants().force, [0.6, 5.0], 1e-8)
+    assert is_close(contact.resultants().force, [0.6, 5.0], 1e-8)
 
 
 def test_tangential_force_below_and_above_the_friction_limit():
@@ -75,19 +75,19 @@ def test_tangential_force_below_and_above_the_friction_limit():
     scene = block("quadrilateral", 1, n=4)
     pull = fem.Constant(scene.mesh, 0.0)
     motion = fc.Motion(force=(pull, 5.0))
-    bcs = [scene.hold(TOP, i) for i in range(2)]
+    bcs = [scene.dirichlet_bc(TOP, i) for i in range(2)]
     problem, contact = scene.problem(
-        fc.Coulomb(0.3, k_n=2e4, k_t=1e4), bcs, contact={"obstacle": cushion(2, motion)}
+        fc.Coulomb(0.3, k_n=2e4, k_t=1e4), bcs, contact={"obstacle": supporting_ball(2, motion)}
     )
     problem.solve()
     problem.commit()
     pull.value = 1.0
     problem.solve()
     problem.commit()
-    assert close(contact.resultants().force, [1.0, 5.0], 1e-8)
+    assert is_close(contact.resultants().force, [1.0, 5.0], 1e-8)
     before = problem.full.state()
     pull.value = 3.0
-    raised_everywhere(problem.solve, (ValueError, fc.NotConverged))
+    assert_raised_on_all_ranks(problem.solve, (ValueError, fc.NotConverged))
     assert np.array_equal(problem.full.state(), before)
 
 
@@ -98,23 +98,25 @@ def test_block_between_floor_and_loaded_obstacle():
     lid = fc.ContactSurface(scene.mesh, scene.tags, TOP)
     weight = fc.HalfSpace((0, 1), (0, -1), displacement=fc.Motion(force=(None, -7.0)))
     top = fc.Contact(scene.u, lid, weight, fc.Frictionless(k_n=1e4), name="weight")
-    problem = fc.ContactProblem(scene.F, scene.u, bcs=[scene.hold(LEFT, 0)], contacts=[floor, top])
+    problem = fc.ContactProblem(
+        scene.F, scene.u, bcs=[scene.dirichlet_bc(LEFT, 0)], contacts=[floor, top]
+    )
     problem.solve()
-    pressure = gathered(COMM, floor.pressure)
-    assert close(pressure, np.full(len(pressure), 7.0), 1e-8)
+    pressure = gather(COMM, floor.pressure)
+    assert is_close(pressure, np.full(len(pressure), 7.0), 1e-8)
     # Both springs and the block in series: 7 (1/k_n + 1/E + 1/k_n).
-    assert close(top.free_motion[1].value, -7.0 * (2 / 1e4 + 1 / 1000), 1e-8)
+    assert is_close(top.free_motion[1].value, -7.0 * (2 / 1e4 + 1 / 1000), 1e-8)
 
 
 def test_distant_loaded_obstacle_reaches_the_body():
     """A distant obstacle is moved to first touch by its force; force and motion to 1e-8."""
     scene = block("quadrilateral", 1, n=4, nu=0.0)
     away = fc.HalfSpace((0, -30.0), (0, 1), displacement=fc.Motion(force=(None, 4.0)))
-    bcs = [scene.hold(TOP, i) for i in range(2)]
+    bcs = [scene.dirichlet_bc(TOP, i) for i in range(2)]
     problem, contact = scene.problem(fc.Frictionless(k_n=1e4), bcs, contact={"obstacle": away})
     problem.solve()
-    assert close(contact.resultants().force[1], 4.0, 1e-8)
-    assert close(contact.free_motion[1].value, 30.0 + 4.0 * (1 / 1e4 + 1 / 1000), 1e-8)
+    assert is_close(contact.resultants().force[1], 4.0, 1e-8)
+    assert is_close(contact.free_motion[1].value, 30.0 + 4.0 * (1 / 1e4 + 1 / 1000), 1e-8)
 
 
 @pytest.mark.parametrize(
@@ -128,7 +130,7 @@ def test_distant_loaded_obstacle_reaches_the_body():
 def test_wrong_motions_are_refused(motion, word):
     """Components with both force and displacement, or a wrong number of them, raise an error."""
     scene = block("triangle", 1)
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: scene.contact(fc.Frictionless(), displacement=motion), ValueError, word
     )
 
@@ -150,7 +152,7 @@ def test_free_motion_of_two_contacts_is_refused(turned):
     halves = dolfinx.mesh.locate_entities_boundary(scene.mesh, 1, lambda x: np.isclose(x[1], 1))
     left = dolfinx.mesh.compute_midpoints(scene.mesh, 1, halves)[:, 0] < 0.5
     tags = dolfinx.mesh.meshtags(scene.mesh, 1, halves, np.where(left, 1, 2).astype(np.int32))
-    bcs = [scene.hold(BOTTOM, i) for i in range(2)]
+    bcs = [scene.dirichlet_bc(BOTTOM, i) for i in range(2)]
 
     def problem(surfaces):
         contacts = [
@@ -166,15 +168,15 @@ def test_free_motion_of_two_contacts_is_refused(turned):
         ]
         return fc.ContactProblem(scene.F, scene.u, bcs=bcs, contacts=contacts)
 
-    raised_everywhere(lambda: problem([1, 2]), ValueError, "on 1 and on 2", "act twice")
+    assert_raised_on_all_ranks(lambda: problem([1, 2]), ValueError, "on 1 and on 2", "act twice")
     step = problem([[1, 2]]).solve()
-    assert close(step.contacts["on [1, 2]"].force[1], -5.0, 1e-8)
+    assert is_close(step.contacts["on [1, 2]"].force[1], -5.0, 1e-8)
 
 
 def test_boundary_form_refuses_an_unknown_motion():
     """The boundary form without a problem has no unknowns for the obstacle's motion: an error."""
     scene = block("triangle", 1)
     contact = scene.contact(fc.Frictionless(k_n=1.0), displacement=fc.Motion(force=(None, 1.0)))
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: contact.form(ufl.TestFunction(scene.u.function_space)), ValueError, "ContactProblem"
     )

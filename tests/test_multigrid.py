@@ -14,14 +14,14 @@ from scipy.spatial.transform import Rotation
 import fenics_contact as fc
 from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.systems import linear
+from scenes.block_on_ball import PATH, BlockOnBall, solve_path, supporting_ball
 from scenes.blocks import BOTTOM as FLOOR
-from scenes.blocks import GRID, LEFT, TOP, block, layers
+from scenes.blocks import GRID, LEFT, TOP, block, layer_partitioner
 from scenes.bodies import boxes
-from scenes.comparing import at_points, close, nodal, raised_everywhere
+from scenes.comparison import assert_raised_on_all_ranks, is_close, nodal_values, point_values
 from scenes.elasticity import residual
-from scenes.rubbing import PATH, Rub, cushion, walk
 from scenes.stacks import ROOF, floor, joint, stack
-from scenes.two_blocks import BOTTOM, LOWER, UPPER, E, two_blocks
+from scenes.two_blocks import BOTTOM, LOWER_FACE, UPPER_FACE, E, two_blocks
 from scenes.two_blocks import TOP as LID
 
 pytestmark = [pytest.mark.three_ranks, pytest.mark.timeout(240)]
@@ -46,18 +46,18 @@ def assert_same_path(cell, degree, method, n, path):
     """
 
     def make(**options):
-        made = Rub(cell=cell, degree=degree, mesh={"n": n}, method=method, **options)
-        steps = walk(made, path=path)
+        made = BlockOnBall(cell=cell, degree=degree, mesh={"n": n}, method=method, **options)
+        steps = solve_path(made, path=path)
         if options["linear_solver"] == "multigrid":
             assert [s.factorisations for s in steps] == [0] * len(path)
         assert made.contact.resultants().slip > 0
         if options["linear_solver"] == "multigrid" and method != "alternating":
             assert made.problem.snes.getKSP().getPC().getMGLevels() > 1
-        return nodal(made.scene.u), at_points(made.contact, made.contact.traction)
+        return nodal_values(made.scene.u), point_values(made.contact, made.contact.traction)
 
     direct, multigrid = both(make)
     for by_factors, by_cycles in zip(direct, multigrid, strict=True):
-        assert close(by_cycles, by_factors, SAME)
+        assert is_close(by_cycles, by_factors, SAME)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -84,11 +84,11 @@ def test_body_constrained_by_contact_alone(cell, method):
         law = fc.Coulomb(0.5, k_n=2e4, k_t=1e4)
         problem, contact = scene.problem(law, [], method=method, **options)
         problem.solve()
-        assert close(contact.resultants().force, -scene.vector(side=0.2, up=-1.0), 1e-9)
-        return nodal(scene.u)
+        assert is_close(contact.resultants().force, -scene.vector(side=0.2, up=-1.0), 1e-9)
+        return nodal_values(scene.u)
 
     direct, multigrid = both(make)
-    assert close(multigrid, direct, SAME)
+    assert is_close(multigrid, direct, SAME)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -97,12 +97,12 @@ def test_problem_without_contact(method):
 
     def make(**options):
         scene = block("triangle", n=16, up=-1.0)
-        bcs = [*scene.rollers(), scene.hold(FLOOR, 1)]
+        bcs = [*scene.rollers(), scene.dirichlet_bc(FLOOR, 1)]
         fc.ContactProblem(scene.F, scene.u, bcs=bcs, method=method, **options).solve()
-        return nodal(scene.u)
+        return nodal_values(scene.u)
 
     direct, multigrid = both(make)
-    assert close(multigrid, direct, SAME)
+    assert is_close(multigrid, direct, SAME)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -122,14 +122,14 @@ def test_two_bodies(cell, method):
         F = residual(u, v, E, 0.3) - ufl.dot(fem.Constant(mesh, load), v) * ds(LID)
         dofs = fem.locate_dofs_topological(space, d - 1, tags.find(BOTTOM))
         bcs = [fem.dirichletbc(np.zeros(d), dofs, space)]
-        surface = fc.ContactSurface(mesh, tags, UPPER)
-        contact = fc.Contact(u, surface, fc.DeformableBody(tags, LOWER), fc.Coulomb(0.3))
+        surface = fc.ContactSurface(mesh, tags, UPPER_FACE)
+        contact = fc.Contact(u, surface, fc.DeformableBody(tags, LOWER_FACE), fc.Coulomb(0.3))
         problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], method=method, **options)
         problem.solve()
-        return nodal(u)
+        return nodal_values(u)
 
     direct, multigrid = both(make)
-    assert close(multigrid, direct, SAME)
+    assert is_close(multigrid, direct, SAME)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -142,26 +142,30 @@ def test_units(method):
     """
     found = []
     for length, pressure in [(1.0, 1.0), (1e-3, 1e6), (1e-9, 1e9)]:
-        made = Rub(
+        made = BlockOnBall(
             cell="hexahedron",
-            mesh={"n": 6, "size": np.full(3, length), "partitioner": layers("hexahedron")},
+            mesh={
+                "n": 6,
+                "size": np.full(3, length),
+                "partitioner": layer_partitioner("hexahedron"),
+            },
             length=length,
             pressure=pressure,
             method=method,
             linear_solver="multigrid",
             petsc_options=TIGHT,
         )
-        steps = walk(made, length, PATH[:2])
-        found.append(([s.iterations for s in steps], nodal(made.scene.u) / length))
+        steps = solve_path(made, length, PATH[:2])
+        found.append(([s.iterations for s in steps], nodal_values(made.scene.u) / length))
     for iterations, u in found[1:]:
         assert iterations == pytest.approx(found[0][0], rel=0.1 if COMM.size > 1 else 0.0)
-        assert close(u, found[0][1], 1e-9)
+        assert is_close(u, found[0][1], 1e-9)
 
 
 def krylov_iterations(n: int, *, rotations: bool) -> int:
     """Return the conjugate gradient iterations for a slender cantilever with n cells across."""
     scene = block("hexahedron", n=(10 * n, n, n), size=(10.0, 1.0, 1.0))
-    bcs = [scene.hold(LEFT, i) for i in range(3)]
+    bcs = [scene.dirichlet_bc(LEFT, i) for i in range(3)]
     problem, _ = scene.problem(fc.Frictionless(), bcs, method="newton", linear_solver="multigrid")
     matrix, solver = problem.solver.equations.matrix(False), problem.solver.equations.solvers[False]
     problem.solver.system.fill(matrix, [])
@@ -189,7 +193,7 @@ def test_iterations_hardly_grow_with_the_mesh():
 # ---- solver selection ----------------------------------------------------------------------------
 
 
-def said(caplog) -> str:
+def log_messages(caplog) -> str:
     """Return the log messages of rank 0."""
     return COMM.bcast("\n".join(r.getMessage() for r in caplog.records))
 
@@ -203,9 +207,11 @@ def test_invalid_solver_options_are_refused():
         scene.problem(fc.Frictionless(), scene.rollers(), **options)
 
     for wrong in ("lu", "", 3):
-        raised_everywhere(lambda w=wrong: make(linear_solver=w), ValueError, "linear_solver")
+        assert_raised_on_all_ranks(
+            lambda w=wrong: make(linear_solver=w), ValueError, "linear_solver"
+        )
     if COMM.size == 1:
-        raised_everywhere(
+        assert_raised_on_all_ranks(
             lambda: make(linear_solver="multigrid", condensation=True), ValueError, "multigrid"
         )
     assert PETSc.Options().getAll() == before
@@ -221,7 +227,7 @@ def test_multigrid_is_selected_if_memory_is_short(caplog, monkeypatch):
         problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
     assert not problem.solver.condensed
     assert problem.full.linear_kind == "multigrid"
-    assert "GiB of memory" in said(caplog) and "multigrid" in said(caplog)
+    assert "GiB of memory" in log_messages(caplog) and "multigrid" in log_messages(caplog)
     assert problem.solve().factorisations == 0
     wanted, _ = scene.problem(fc.Frictionless(), scene.rollers(), linear_solver="direct")
     assert wanted.full.linear_kind == "direct"
@@ -334,26 +340,26 @@ def test_free_obstacle_is_solved_by_factorisation(caplog):
     with caplog.at_level(logging.INFO, logger="fenics_contact"):
         problem, contact = scene.problem(
             fc.Frictionless(k_n=2e4),
-            [scene.hold(TOP, i) for i in range(2)],
-            contact={"obstacle": cushion(2, motion)},
+            [scene.dirichlet_bc(TOP, i) for i in range(2)],
+            contact={"obstacle": supporting_ball(2, motion)},
             linear_solver="multigrid",
         )
     assert problem.full.linear_kind == "direct"
-    assert "unknown motions" in said(caplog)
+    assert "unknown motions" in log_messages(caplog)
     problem.solve()
-    assert close(contact.resultants().force[1], 5.0, 1e-8)
+    assert is_close(contact.resultants().force[1], 5.0, 1e-8)
 
 
 def test_options_reach_the_multigrid_levels():
     """Options for nested solvers are applied, and do not remain in PETSc's database."""
     before = PETSc.Options().getAll()
-    made = Rub(
+    made = BlockOnBall(
         method="lbfgs",
         linear_solver="multigrid",
         petsc_options={"mg_levels_pc_type": "jacobi", "mg_levels_ksp_max_it": 3},
         mesh={"n": 16},
     )
-    walk(made, path=PATH[:1])
+    solve_path(made, path=PATH[:1])
     smoother = made.problem.solver.equations.solvers[False].getPC().getMGSmoother(1)
     assert smoother.getPC().getType() == "jacobi"
     assert smoother.getTolerances()[3] == 3
@@ -423,8 +429,8 @@ def test_level_matrices_are_galerkin_products(cell):
     """
     n = 24 if cell == "triangle" else 8
     options = {"linear_solver": "multigrid", "condensation": False, "method": "lbfgs"}
-    made = Rub(cell=cell, mesh={"n": n}, **options)
-    walk(made, path=PATH)
+    made = BlockOnBall(cell=cell, mesh={"n": n}, **options)
+    solve_path(made, path=PATH)
     assert made.problem.solver.equations.hierarchy.set_ups == 1
     pc = made.problem.snes.getKSP().getPC()
     matrices, maps = levels_of(pc)
@@ -457,8 +463,8 @@ def test_finite_sliding_pairs_rebuild_the_levels(cell):
             problem.solve()
             problem.commit()
             slips.append(contacts[1].resultants().slip)
-        return nodal(body.u), np.array(slips)
+        return nodal_values(body.u), np.array(slips)
 
     direct, multigrid = both(make)
     for by_factors, by_cycles in zip(direct, multigrid, strict=True):
-        assert close(by_cycles, by_factors, SAME)
+        assert is_close(by_cycles, by_factors, SAME)

@@ -14,10 +14,10 @@ import fenics_contact as fc
 from fenics_contact.results import drawing
 from fenics_contact.results.obstacles import ObstacleShape, zero_level
 from scenes import vtu
-from scenes.blocks import block, bulge
-from scenes.comparing import close, on_first, shared_folder
-from scenes.rubber import Tool
-from scenes.rubbing import Rub
+from scenes.block_on_ball import BlockOnBall
+from scenes.blocks import block, parabolic_floor
+from scenes.comparison import check_on_first_rank, is_close, shared_folder
+from scenes.rubber import DiscOnRubber
 
 COMM = MPI.COMM_WORLD
 FINE = 1e-4
@@ -31,7 +31,7 @@ def circle(centre, radius):
 
 def obstacles(mesh):
     """Return, by name, obstacles and the equations of their displaced surfaces."""
-    way, angle = fem.Constant(mesh, (0.1, 0.2)), fem.Constant(mesh, 0.0)
+    displacement, angle = fem.Constant(mesh, (0.1, 0.2)), fem.Constant(mesh, 0.0)
     points = np.array([[0.2, 0.2], [0.8, 0.2], [0.5, 0.7]])
     corners = np.array([[0, 1], [1, 2], [2, 0]])
 
@@ -47,10 +47,10 @@ def obstacles(mesh):
     round_ = 0.5 + 0.3 * np.column_stack([np.cos(t), np.sin(t)])
     return {
         "plane": (fc.HalfSpace((0, 0.3), (1, 2)), lambda x: (x - [0, 0.3]) @ [1, 2] / 5**0.5),
-        "moved": (fc.Ball((0.4, 0.3), 0.3, displacement=way), circle((0.5, 0.5), 0.3)),
+        "moved": (fc.Ball((0.4, 0.3), 0.3, displacement=displacement), circle((0.5, 0.5), 0.3)),
         "hole": (fc.Cylinder((0.5, 0.5), 0.3, inside=True), circle((0.5, 0.5), 0.3)),
         "distance": (
-            fc.SignedDistance(lambda x: ufl.sqrt(ufl.dot(x, x)) - way[1] * 3),
+            fc.SignedDistance(lambda x: ufl.sqrt(ufl.dot(x, x)) - displacement[1] * 3),
             circle((0, 0), 0.6),
         ),
         "spline": (fc.RigidProfile(round_, closed=True), circle((0.5, 0.5), 0.3)),
@@ -92,15 +92,15 @@ def test_drawn_surface_in_the_plane(name):
                 np.linalg.norm(s[:, 1] - s[:, 0], axis=1).sum()
                 for s in (found, zero_level(grid, values))
             ]
-            assert close(lengths[0], lengths[1], 1e-2)
+            assert is_close(lengths[0], lengths[1], 1e-2)
 
-    on_first(check)
+    check_on_first_rank(check)
 
 
 @pytest.mark.parametrize("cell", ["tetrahedron", "hexahedron"])
 def test_drawn_surface_in_space(cell):
     """The part of a ball in the box has the area 2π R h of a cap of height h, to 1 %."""
-    made = Rub(cell=cell)
+    made = BlockOnBall(cell=cell)
 
     def check():
         box = np.array([[-2.5, -2.5, -1.0], [3.5, 3.5, 5.0]])
@@ -109,16 +109,16 @@ def test_drawn_surface_in_space(cell):
         assert np.abs(np.linalg.norm(found.reshape(-1, 3) - middle, axis=1) - 2.0).max() < 1e-2
         edges = found[:, 1:] - found[:, :1]
         area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum() / 2
-        assert close(area, 2 * np.pi * 2.0 * 1.0, 1e-2)
+        assert is_close(area, 2 * np.pi * 2.0 * 1.0, 1e-2)
 
-    on_first(check)
+    check_on_first_rank(check)
 
 
 def test_prescribed_gap_is_not_drawn():
     """A gap prescribed on Γc, by a function or a number, has no known shape."""
     scene = block("triangle")
     for options in (
-        {"obstacle": bulge(scene)},
+        {"obstacle": parabolic_floor(scene)},
         {"obstacle": fc.PrescribedGap(0.1, (0.0, -1.0))},
         {"gap": 0.1},
     ):
@@ -128,24 +128,24 @@ def test_prescribed_gap_is_not_drawn():
 def test_magnified_displacement_and_previous_states():
     """Displacements of obstacles are magnified; frames use the displacements of their own state."""
     scene = block("triangle")
-    way = fem.Constant(scene.mesh, (0.0, -0.01))
-    contact = scene.contact(fc.Frictionless(1e3), displacement=way)
+    displacement = fem.Constant(scene.mesh, (0.0, -0.01))
+    contact = scene.contact(fc.Frictionless(1e3), displacement=displacement)
 
     def check():
         shape, box = ObstacleShape(contact), np.array([[0.0, -1.0], [1.0, 1.0]])
         before = shape.state()
-        way.value[1] = -0.02
+        displacement.value[1] = -0.02
         for state, depth in ((None, -0.4), (before, -0.2)):
             found = shape(box, 20.0, state)[..., 1]
             assert len(found) and np.abs(found - depth).max() < 1e-12
 
-    on_first(check)
+    check_on_first_rank(check)
 
 
 def test_obstacle_in_pictures_animations_and_files(tmp_path, monkeypatch):
     """A tool moves down on rubber: all outputs show it at its position at the time."""
     folder = shared_folder(tmp_path)
-    made = Tool(law=fc.Frictionless(1e4))
+    made = DiscOnRubber(law=fc.Frictionless(1e4))
     figures, save = [], drawing.save
     monkeypatch.setattr(drawing, "save", lambda f, path: (figures.append(f), save(f, path)))
     writer = fc.Writer(folder / "files", made.problem)
@@ -165,14 +165,14 @@ def test_obstacle_in_pictures_animations_and_files(tmp_path, monkeypatch):
         colour = drawing.COLOURS["obstacle"]
         drawn = [c for f in figures for c in f.axes[0].collections if is_of(c, colour)]
         assert len(drawn) == 2
-        series = vtu.series(folder / "files" / "contact_obstacle.pvd")
+        series = vtu.read_collection(folder / "files" / "contact_obstacle.pvd")
         assert len(series) == 2
-        grids = [vtu.read(folder / "files" / name) for _, name in series]
+        grids = [vtu.read_vtu(folder / "files" / name) for _, name in series]
         assert all(grid.kind == 3 and len(grid.x) > 20 for grid in grids)
         # It has moved down.
         assert grids[1].x[..., 1].min() < grids[0].x[..., 1].min() - 1e-3
 
-    on_first(check)
+    check_on_first_rank(check)
 
 
 def is_of(collection, colour):

@@ -14,10 +14,10 @@ from fenics_contact.checks.obstacle_probe import RigidObstacleProbe
 from fenics_contact.checks.tunnelling import TunnellingCheck
 from fenics_contact.elasticity import NeoHookean
 from scenes.blocks import BOTTOM, TOP, block, kirchhoff
-from scenes.comparing import close, gathered, raised_everywhere
-from scenes.elasticity import hold
-from scenes.rubber import Tool, rubber
-from scenes.two_blocks import LOWER, UPPER, two_blocks
+from scenes.comparison import assert_raised_on_all_ranks, gather, is_close
+from scenes.elasticity import dirichlet_bc
+from scenes.rubber import DiscOnRubber, rubber
+from scenes.two_blocks import LOWER_FACE, UPPER_FACE, two_blocks
 
 COMM = MPI.COMM_WORLD
 pytestmark = pytest.mark.two_ranks
@@ -102,8 +102,8 @@ def test_user_defined_obstacle_needs_distance_and_unit_normal(kinematics, wrong,
             with pytest.raises(fc.NotConverged, match=match):
                 problem.solve()
             return
-        for way in (0.0, 0.02, 0.04):
-            shift.value[0] = way
+        for displacement in (0.0, 0.02, 0.04):
+            shift.value[0] = displacement
             problem.solve()
             problem.commit()
         forces.append(contact.resultants().force)
@@ -161,7 +161,9 @@ def test_return_value_of_place_is_checked(place, words):
         def place(self, x, to_ufl):
             return place(x)
 
-    raised_everywhere(lambda: scene.problem(Own(), fc.Coulomb(0.2)), ValueError, "Own.place", words)
+    assert_raised_on_all_ranks(
+        lambda: scene.problem(Own(), fc.Coulomb(0.2)), ValueError, "Own.place", words
+    )
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
@@ -180,7 +182,7 @@ def test_error_names_an_invalid_distance_function(distance, words, kinematics):
     """The error names the obstacle, unlike UFL's "Index out of bounds", "Division by zero"."""
     scene = block()
     obstacle = fc.SignedDistance(distance)
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: scene.contact(fc.Frictionless(), obstacle=obstacle, kinematics=kinematics),
         ValueError,
         "distance of the SignedDistance",
@@ -197,10 +199,10 @@ def test_normals_and_axes_of_any_length(length):
         lambda size: fc.Cylinder((0.4, 0.5, -1.1), 1.0, axis=(size, 0.2 * size, 0.0)),
     ):
         gaps = [
-            gathered(COMM, scene.contact(fc.Frictionless(), obstacle=made(size)).gap)
+            gather(COMM, scene.contact(fc.Frictionless(), obstacle=made(size)).gap)
             for size in (1.0, length)
         ]
-        assert close(gaps[1], gaps[0], 1e-14, scale=1.0)
+        assert is_close(gaps[1], gaps[0], 1e-14, scale=1.0)
 
 
 def test_penetration_beyond_half_the_radius_is_refused():
@@ -234,7 +236,7 @@ def test_tunnelling_of_a_roller_in_one_increment_is_refused():
     contact.evaluate()
     probe = RigidObstacleProbe(contact)
     gone, x = (
-        gathered(COMM, each)[:, 0] for each in (probe.find_crossed(np.zeros(len(probe.x))), probe.x)
+        gather(COMM, each)[:, 0] for each in (probe.find_crossed(np.zeros(len(probe.x))), probe.x)
     )
     # It has crossed all probe points below its middle half, and none beyond its radius.
     middle = x[np.abs(x) < 0.5 * radius]
@@ -253,7 +255,7 @@ def test_nan_in_gap_or_normal_is_refused(distance):
     scene = rubber(n=(4, 2), E=10.0)
     obstacle = fc.SignedDistance(lambda x: distance(scene.height - x[1]))
     problem, _ = scene.problem(obstacle, fc.Frictionless(1e3))
-    raised_everywhere(problem.solve, fc.NotConverged, "is not a number")
+    assert_raised_on_all_ranks(problem.solve, fc.NotConverged, "is not a number")
 
 
 def test_nan_gap_at_the_end_of_an_increment_is_refused():
@@ -268,7 +270,7 @@ def test_nan_gap_at_the_end_of_an_increment_is_refused():
         problem.solve()
         problem.commit()
     shift.value[0] = 3.5
-    raised_everywhere(problem.solve, fc.NotConverged, "is not a number")
+    assert_raised_on_all_ranks(problem.solve, fc.NotConverged, "is not a number")
 
 
 def test_sliding_around_an_obstacle_is_not_tunnelling():
@@ -294,13 +296,13 @@ def test_rotation_by_more_than_a_right_angle_is_refused(shape):
     the points, to 1e-9 (ball) or 1e-5 (profile). Without contact any rotation is accepted.
     """
     for angle in (1.5 * np.pi, 2 * np.pi):
-        tool = Tool(radius=0.8, law=fc.Coulomb(0.3, 1e4, 1e4), shape=shape)
-        tool.go(0.0, 0.01)
-        tool.go(0.0, 0.01, -angle)
-        tool.go(0.0, -0.05, -angle)
-        tool.go(0.0, -0.1, -angle)
+        tool = DiscOnRubber(radius=0.8, law=fc.Coulomb(0.3, 1e4, 1e4), shape=shape)
+        tool.solve_increment(0.0, 0.01)
+        tool.solve_increment(0.0, 0.01, -angle)
+        tool.solve_increment(0.0, -0.05, -angle)
+        tool.solve_increment(0.0, -0.1, -angle)
         with pytest.raises(fc.NotConverged, match=r"rotates by .* rad in one increment"):
-            tool.go(0.0, -0.1, 0.0)
+            tool.solve_increment(0.0, -0.1, 0.0)
 
         def turn(t, tool=tool, angle=angle):
             tool.angle.value = (t - 1) * angle
@@ -351,7 +353,7 @@ def test_relative_stiffness_follows_a_modulus_set_later(linear):
     for first in (1000.0, 1.0):
         scene = block("quadrilateral", n=(6, 3), E=first)
         shift = fem.Constant(scene.mesh, (0.0, 0.01))
-        held = [scene.hold(TOP, i) for i in range(2)]
+        held = [scene.dirichlet_bc(TOP, i) for i in range(2)]
         law = {"displacement": shift}
         if not linear:
             scene.F = kirchhoff(scene)
@@ -359,7 +361,7 @@ def test_relative_stiffness_follows_a_modulus_set_later(linear):
         scene.E.value = 1000.0
         problem.solve()
         forces.append(contact.resultants().force)
-    assert close(np.array(forces[0]), np.array(forces[1]), 1e-6)
+    assert is_close(np.array(forces[0]), np.array(forces[1]), 1e-6)
     assert forces[0][1] > 1.0
 
 
@@ -379,7 +381,7 @@ def test_initial_displacement_is_the_slip_reference(kinematics, late):
             problem, contact = scene.problem(
                 plate, fc.Coulomb(0.2), contact={"kinematics": kinematics}
             )
-        for field in (scene.u, scene.held):
+        for field in (scene.u, scene.prescribed):
             field.interpolate(lambda x, a=aside: np.array([a + 0 * x[0], 0 * x[0]]))
         if not late:
             problem, contact = scene.problem(
@@ -388,7 +390,7 @@ def test_initial_displacement_is_the_slip_reference(kinematics, late):
         problem.solve()
         problem.commit()
         forces.append(contact.resultants().force)
-    assert close(np.array(forces[0]), np.array(forces[1]), 1e-6)
+    assert is_close(np.array(forces[0]), np.array(forces[1]), 1e-6)
     assert abs(forces[0][1]) > 1.0
 
 
@@ -404,10 +406,10 @@ def test_rubber_on_rubber_with_updated_pairs():
         u, v = fem.Function(space), ufl.TestFunction(space)
         body = NeoHookean(u, 10.0, 0.3, "plane strain")
         move = [fem.Constant(mesh, 0.0) for _ in range(2)]
-        bcs = [hold(u, tags, BOTTOM, i) for i in range(2)]
-        bcs += [hold(u, tags, TOP, i, value) for i, value in enumerate(move)]
-        base = fc.DeformableBody(tags, LOWER, update_pairs="increment")
-        contact = fc.Contact(u, fc.ContactSurface(mesh, tags, UPPER), base, fc.Frictionless())
+        bcs = [dirichlet_bc(u, tags, BOTTOM, i) for i in range(2)]
+        bcs += [dirichlet_bc(u, tags, TOP, i, value) for i, value in enumerate(move)]
+        base = fc.DeformableBody(tags, LOWER_FACE, update_pairs="increment")
+        contact = fc.Contact(u, fc.ContactSurface(mesh, tags, UPPER_FACE), base, fc.Frictionless())
         problem = fc.ContactProblem(body.residual(v), u, bcs=bcs, contacts=[contact])
         for number in range(1, steps + 1):
             move[1].value = -0.05 * number / steps

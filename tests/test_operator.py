@@ -16,8 +16,8 @@ from petsc4py import PETSc
 import fenics_contact as fc
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.unknowns import DofSubset, Unknowns
-from scenes.elasticity import displacement_space, hold, residual
-from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, Slider, two_blocks
+from scenes.elasticity import dirichlet_bc, displacement_space, residual
+from scenes.two_blocks import BOTTOM, LOWER_FACE, TOP, UPPER_FACE, SlidingBlock, two_blocks
 
 pytestmark = pytest.mark.two_ranks
 
@@ -49,7 +49,7 @@ def same(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
 
 def test_operator_is_immutable():
     """No increment, restricted law or other operator changes it; updated pairs need another."""
-    slider = Slider("triangle", LAW, start=1.0, n=(8, 3))
+    slider = SlidingBlock("triangle", LAW, start=1.0, n=(8, 3))
     contact, unknowns = slider.contact, slider.problem.full.unknowns
     kept = np.arange(0, unknowns.n_dofs, 2, dtype=np.int32)
     whole = ContactOperator(contact, unknowns)
@@ -72,7 +72,7 @@ def test_operators_on_different_dofs_are_independent():
     mesh, tags = two_blocks("triangle", (5, 3))
     u = fem.Function(displacement_space(mesh, 1))
     contact = fc.Contact(
-        u, fc.ContactSurface(mesh, tags, UPPER), fc.DeformableBody(tags, LOWER), LAW
+        u, fc.ContactSurface(mesh, tags, UPPER_FACE), fc.DeformableBody(tags, LOWER_FACE), LAW
     )
     unknowns = Unknowns(u.function_space)
     kept = np.arange(1, unknowns.n_dofs, 3, dtype=np.int32)
@@ -89,11 +89,15 @@ def test_updated_pairs_replace_the_operator_of_their_contact_only():
     mesh, tags = two_blocks("triangle", (4, 3))
     u = fem.Function(displacement_space(mesh, 1))
     pair = fc.Contact(
-        u, fc.ContactSurface(mesh, tags, UPPER), fc.DeformableBody(tags, LOWER), LAW, name="pair"
+        u,
+        fc.ContactSurface(mesh, tags, UPPER_FACE),
+        fc.DeformableBody(tags, LOWER_FACE),
+        LAW,
+        name="pair",
     )
     ground = fc.HalfSpace(point=(0, 0), normal=(0, 1))
     floor = fc.Contact(u, fc.ContactSurface(mesh, tags, BOTTOM), ground, LAW, name="floor")
-    bcs = [hold(u, tags, TOP, i) for i in range(2)]
+    bcs = [dirichlet_bc(u, tags, TOP, i) for i in range(2)]
     F = residual(u, ufl.TestFunction(u.function_space), 1e6, 0.3)
     problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[pair, floor])
     system = problem.full
@@ -114,7 +118,7 @@ def test_matrix_in_3d_has_no_entries_for_open_points():
     Its pattern has the entries of the bulk and the closed points only, whatever it contained
     before, so that a factorisation costs no more than necessary.
     """
-    slider = Slider("tetrahedron", LAW, start=1.0, n=(6, 2), condensation=False)
+    slider = SlidingBlock("tetrahedron", LAW, start=1.0, n=(6, 2), condensation=False)
     slider.step(0.002, 0.0)
     system, contact = slider.problem.full, slider.contact
     operator, springs = system.operators[0], contact.values.springs(1.0, 1.0)

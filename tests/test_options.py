@@ -9,17 +9,17 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from scenes.comparing import raised_everywhere
-from scenes.processes import command, environment
-from scenes.rubbing import Rub, walk
+from scenes.block_on_ball import BlockOnBall, solve_path
+from scenes.comparison import assert_raised_on_all_ranks
+from scenes.processes import command, subprocess_environment
 
 COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 SCRIPT = """
-from scenes.rubbing import PATH, Rub
-made = Rub({arguments})
-made.move(*PATH[0])
+from scenes.block_on_ball import PATH, BlockOnBall
+made = BlockOnBall({arguments})
+made.set_top_displacement(*PATH[0])
 made.problem.solve()
 if made.problem.u.function_space.mesh.comm.rank == 0:
     print("at most", made.problem.solver.main.max_it)
@@ -46,7 +46,7 @@ def test_script_takes_options_of_the_command_line(ranks: int, arguments: str) ->
     """Monitors print, whichever method solves the first increment, and values take effect."""
     words = command(ranks, "-c", SCRIPT.format(arguments=arguments), "mesh.msh", "-n", "3")
     words += ["-contact_snes_monitor", "-contact_snes_max_it", "737"]
-    done = subprocess.run(words, env=environment(), capture_output=True, text=True)
+    done = subprocess.run(words, env=subprocess_environment(), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "SNES Function norm" in done.stdout
     assert "at most 737" in done.stdout
@@ -59,7 +59,7 @@ def test_values_of_options_are_parsed(command_line) -> None:
         *("-x", "--tb", "short", "-mine_snes_max_it", "7", "--mine_snes_max_it", "8", "mesh.msh"),
         *("-mine_number", "-1e-3", "-mine_snes_monitor", "-mine_own", "two words", "-mine_"),
     )
-    made = Rub(prefix="mine_")
+    made = BlockOnBall(prefix="mine_")
     options = PETSc.Options()
     taken = {n: options.getString(n) for n in options.getAll() if n.startswith("mine_")}
     assert taken == {
@@ -79,15 +79,15 @@ def test_precedence_of_options(command_line) -> None:
     """
     command_line("-mine_snes_max_it", "7", "-mine_snes_type", "qn", "-snes_max_it", "9")
     PETSc.Options().setValue("mine_snes_type", "newtonls")
-    made = Rub(prefix="mine_", petsc_options={"snes_max_it": 8, "snes_type": "ngmres"})
+    made = BlockOnBall(prefix="mine_", petsc_options={"snes_max_it": 8, "snes_type": "ngmres"})
     assert made.problem.snes.getTolerances()[3] == 7
     assert made.problem.snes.getType() == "newtonls"
-    usual = Rub(prefix="").problem.snes.getTolerances()[3]
-    assert usual == Rub().problem.snes.getTolerances()[3] != 9
+    usual = BlockOnBall(prefix="").problem.snes.getTolerances()[3]
+    assert usual == BlockOnBall().problem.snes.getTolerances()[3] != 9
 
 
 @pytest.mark.whole
-@pytest.mark.parametrize("said", ["command line", "petsc_options"])
+@pytest.mark.parametrize("message", ["command line", "petsc_options"])
 @pytest.mark.parametrize(
     ("name", "value", "why"),
     [
@@ -98,20 +98,20 @@ def test_precedence_of_options(command_line) -> None:
         ("snes_qn_m", "-1", "must be a non-negative integer"),  # checked when it is set up
     ],
 )
-def test_values_refused_by_petsc_are_named(command_line, said, name, value, why) -> None:
+def test_values_refused_by_petsc_are_named(command_line, message, name, value, why) -> None:
     """The error names the option and PETSc's message, wherever the option was given."""
-    options = {"petsc_options": {name: value}} if said == "petsc_options" else {}
+    options = {"petsc_options": {name: value}} if message == "petsc_options" else {}
     if not options:
         command_line(f"-contact_{name}", value)
     words = "PETSc refuses an option with prefix", why, f"-contact_{name} {value}"
     method = "lbfgs" if "_qn_" in name else "newton"
-    raised_everywhere(lambda: Rub(method=method, **options), ValueError, *words)
+    assert_raised_on_all_ranks(lambda: BlockOnBall(method=method, **options), ValueError, *words)
 
 
 def test_command_line_of_first_rank_is_used_on_all_ranks(command_line) -> None:
     """If the ranks have different command lines, that of the first rank is used."""
     command_line("-mine_snes_max_it", str(7 + COMM.rank))
-    made = Rub(prefix="mine_")
+    made = BlockOnBall(prefix="mine_")
     assert set(COMM.allgather(made.problem.snes.getTolerances()[3])) == {7}
 
 
@@ -140,11 +140,13 @@ def test_unused_options_are_named(command_line, method, condensation, caplog) ->
         line += [f"-mine_{name}", *([] if value is None else [str(value).lower()])]
     command_line(*line)
     given = {"snes_maxit": 3, "snes_force_iteration": False}
-    made = Rub(prefix="mine_", method=method, condensation=condensation, petsc_options=given)
+    made = BlockOnBall(
+        prefix="mine_", method=method, condensation=condensation, petsc_options=given
+    )
     with caplog.at_level("WARNING", logger="fenics_contact"):
-        walk(made)
-    said = [r.message for r in caplog.records if "unused options" in r.message]
-    assert len(said) == (COMM.rank == 0)
-    if said:
-        (said,) = said
-        assert "-mine_ksp_typ, -mine_snes_maxit, -mine_snes_monitr;" in said
+        solve_path(made)
+    message = [r.message for r in caplog.records if "unused options" in r.message]
+    assert len(message) == (COMM.rank == 0)
+    if message:
+        (message,) = message
+        assert "-mine_ksp_typ, -mine_snes_maxit, -mine_snes_monitr;" in message

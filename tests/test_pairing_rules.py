@@ -19,10 +19,10 @@ from fenics_contact.checks.tunnelling import TunnellingCheck
 from fenics_contact.checks.verdict import check_laws
 from scenes import vtu
 from scenes.bodies import Bodies, boxes
-from scenes.comparing import close, raised_everywhere, shared_folder
-from scenes.meshes import mesh_of
+from scenes.comparison import assert_raised_on_all_ranks, is_close, shared_folder
+from scenes.meshes import create_mesh
 from scenes.stacks import FLOOR, LOWER, OUTSIDE, ROOF, SIDES, UPPER, E, joint, rings, stack
-from scenes.tags import between, either, near, tagged
+from scenes.tags import any_of, at_coordinate, at_interface, tag_by_midpoints
 
 COMM = MPI.COMM_WORLD
 BOTH = 40
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.mpi
 
 
 @contextmanager
-def _told(expected, *words):
+def _assert_warning(expected, *words):
     """Assert that a warning with these words is given on every rank, or no warning at all."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -55,10 +55,10 @@ def plates(cell, thickness, apart, *, layers=2, bend=None, degree=1):
         axes.append([line] * (d - 1) + [np.linspace(low, high, layers + 1)])
         flats += [low, high]
         low = high + (apart[j] if j < len(apart) else 0.0)
-    marks = {BOTH: either(*(near(d - 1, v) for v in flats))}
+    marks = {BOTH: any_of(*(at_coordinate(d - 1, v) for v in flats))}
     for j in range(len(axes)):
-        marks[10 * j + LOWER] = between(d - 1, flats[2 * j + 1], above=False)
-        marks[10 * j + UPPER] = between(d - 1, flats[2 * j], above=True)
+        marks[10 * j + LOWER] = at_interface(d - 1, flats[2 * j + 1], above=False)
+        marks[10 * j + UPPER] = at_interface(d - 1, flats[2 * j], above=True)
     return axes, marks
 
 
@@ -79,7 +79,7 @@ def test_plate_is_not_paired_with_its_own_back(cell, layers):
     height = points["x"][:, -1]
     inner = (height > 0.04) & (height < 0.26)
     assert np.all(np.isnan(points["gap"][~inner]))
-    assert close(points["gap"][inner], np.full(inner.sum(), 0.2), 1e-12)
+    assert is_close(points["gap"][inner], np.full(inner.sum(), 0.2), 1e-12)
     assert contact.n_unpaired == np.count_nonzero(~inner)
 
 
@@ -89,13 +89,13 @@ def test_lifted_plates_have_no_contact_force(cell):
     sunk, k_n = 1e-3, 1e7
     axes, marks = plates(cell, 0.05, [0.0])
     d = len(axes[0])
-    marks = {FLOOR: near(d - 1, 0), UPPER: marks[10 + UPPER], LOWER: marks[LOWER]}
-    marks[ROOF] = near(d - 1, 0.1)
+    marks = {FLOOR: at_coordinate(d - 1, 0), UPPER: marks[10 + UPPER], LOWER: marks[LOWER]}
+    marks[ROOF] = at_coordinate(d - 1, 0.1)
     body = Bodies(boxes(axes, marks, simplex=cell == "triangle"), E, 0.0)
     up = body.constant(0.0)
-    body.hold(FLOOR, *range(d))
-    body.hold(ROOF, *range(d - 1))
-    body.hold(ROOF, d - 1, value=up)
+    body.prescribe(FLOOR, *range(d))
+    body.prescribe(ROOF, *range(d - 1))
+    body.prescribe(ROOF, d - 1, value=up)
     obstacle = fc.DeformableBody(body.tags, [LOWER, ROOF], update_pairs="increment")
     contact = body.contact(UPPER, obstacle, fc.Frictionless(k_n))
     problem = body.problem(contact)
@@ -105,7 +105,7 @@ def test_lifted_plates_have_no_contact_force(cell):
         problem.commit()
         assert contact.n_unpaired == 0
         expected = 0.0 if height > 0 else sunk / (0.1 / E + 1 / k_n)
-        assert close(contact.resultants().normal_force, expected, 1e-8, scale=1e3)
+        assert is_close(contact.resultants().normal_force, expected, 1e-8, scale=1e3)
 
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
@@ -114,13 +114,13 @@ def test_three_plates_in_one_tag(cell):
     q, k_n = 5e3, 1e7
     axes, marks = plates(cell, 0.02, [0.0, 0.0], layers=1)
     d = 3 if cell == "hexahedron" else 2
-    ends = either(*(near(i, v) for i in range(d - 1) for v in (0.0, 1.0)))
+    ends = any_of(*(at_coordinate(i, v) for i in range(d - 1) for v in (0.0, 1.0)))
     body = Bodies(boxes(axes, {BOTH: marks[BOTH], SIDES: ends}, simplex=cell == "triangle"), E, 0.0)
     space = body.u.function_space
     low = dolfinx.mesh.locate_entities_boundary(body.mesh, d - 1, lambda x: np.abs(x[d - 1]) < 1e-9)
     still = fem.locate_dofs_topological(space.sub(d - 1), d - 1, low)
     body.bcs = [fem.dirichletbc(body.constant(0.0), still, space.sub(d - 1))]
-    body.hold(SIDES, *range(d - 1))
+    body.prescribe(SIDES, *range(d - 1))
     top = ufl.conditional(ufl.gt(body.x[d - 1], 0.06 - 1e-9), 1.0, 0.0)
     body.F += q * top * body.v[d - 1] * body.ds(BOTH)
     contact = body.contact(BOTH, BOTH, fc.Frictionless(k_n))
@@ -129,7 +129,7 @@ def test_three_plates_in_one_tag(cell):
     points = contact.gather()
     inner = (points["x"][:, -1] > 1e-6) & (points["x"][:, -1] < 0.06 - 1e-6)
     assert contact.n_unpaired == np.count_nonzero(~inner)
-    assert close(points["pressure"][inner], np.full(inner.sum(), q / 2), 1e-8)
+    assert is_close(points["pressure"][inner], np.full(inner.sum(), q / 2), 1e-8)
     assert np.all(points["pressure"][~inner] == 0.0)
 
 
@@ -140,11 +140,14 @@ def test_long_facet_in_front_of_short_ones_is_paired():
         [np.array([0.0, 1.0]), np.array([0.01, 0.02])],
         [np.linspace(0, 1, 8), np.array([0.03, 0.1])],
     ]
-    sides = {LOWER: either(near(1, 0.0), near(1, 0.02)), UPPER: near(1, 0.03)}
+    sides = {
+        LOWER: any_of(at_coordinate(1, 0.0), at_coordinate(1, 0.02)),
+        UPPER: at_coordinate(1, 0.03),
+    }
     body = Bodies(boxes(axes, sides), E, 0.3)
     contact = body.contact(UPPER, LOWER, fc.Frictionless(1e6))
     gap = contact.gather()["gap"]
-    assert close(gap, np.full(len(gap), 0.01), 1e-12)
+    assert is_close(gap, np.full(len(gap), 0.01), 1e-12)
 
 
 @pytest.mark.parametrize("opening", [0.0, 0.05])
@@ -174,38 +177,38 @@ def cut_square(n, opening):
     above = x[cells].mean(axis=1)[:, 1] > 0
     cells[above] = twin[cells[above]]
     x = np.concatenate([x, x[cut] + np.column_stack([0 * cut, opening * x[cut, 0]])])
-    mesh = mesh_of("quadrilateral", x, cells)
+    mesh = create_mesh("quadrilateral", x, cells)
 
     def lip(side):
         return lambda x, cell: (
             (np.abs(x[:, 1]) < 0.06) & (x[:, 0] % 1 > 1e-9) & (side * cell[:, 1] > 0)
         )
 
-    return mesh, tagged(mesh, {FLOOR: lip(1), ROOF: lip(-1), SIDES: near(0, -1)})
+    return mesh, tag_by_midpoints(mesh, {FLOOR: lip(1), ROOF: lip(-1), SIDES: at_coordinate(0, -1)})
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_interference_deeper_than_a_cell_is_paired(cell, kinematics):
     """Blocks that overlap by 0.2, twice the height of their cells, have pairs everywhere."""
-    body = stack(cell, (10, 10) if cell == "triangle" else (4, 5), (0.5, 0.5), apart=-0.2)
+    body = stack(cell, (10, 10) if cell == "triangle" else (4, 5), (0.5, 0.5), gap=-0.2)
     contact = joint(body, 1, fc.Frictionless(1e6), kinematics=kinematics)
     contact.evaluate()
     assert contact.n_unpaired == 0
     gap = contact.gather()["gap"]
-    assert close(gap, np.full(len(gap), -0.2), 1e-12)
+    assert is_close(gap, np.full(len(gap), -0.2), 1e-12)
 
 
 def test_max_initial_penetration():
     """A given ``max_initial_penetration`` bounds pairs; a negative one is refused."""
-    body = stack("quadrilateral", (10, 10), (0.5, 0.5), apart=-0.2)
+    body = stack("quadrilateral", (10, 10), (0.5, 0.5), gap=-0.2)
     law = fc.Frictionless(1e6)
     for release, unpaired in ((0.25, False), (0.15, True)):
         obstacle = fc.DeformableBody(body.tags, 10 + LOWER, max_initial_penetration=release)
-        with _told(unpaired, "behind"):
+        with _assert_warning(unpaired, "behind"):
             contact = body.contact(10 + UPPER, obstacle, law)
         assert (contact.n_unpaired > 0) == unpaired
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: fc.DeformableBody(body.tags, 10 + LOWER, max_initial_penetration=-1.0),
         ValueError,
         "max_initial_penetration",
@@ -215,10 +218,10 @@ def test_max_initial_penetration():
 def test_soft_contact_keeps_its_pairs():
     """Bodies with springs so soft that they overlap by several cells still have pairs."""
     body = stack("quadrilateral", (8, 10), (0.5, 0.5))
-    body.hold(FLOOR, 0, 1)
+    body.prescribe(FLOOR, 0, 1)
     down = body.constant(0.0)
-    body.hold(ROOF, 0)
-    body.hold(ROOF, 1, value=down)
+    body.prescribe(ROOF, 0)
+    body.prescribe(ROOF, 1, value=down)
     obstacle = fc.DeformableBody(body.tags, 10 + LOWER, update_pairs="increment")
     contact = body.contact(10 + UPPER, obstacle, fc.Frictionless(1.0))
     problem = body.problem(contact)
@@ -227,7 +230,7 @@ def test_soft_contact_keeps_its_pairs():
         problem.solve()
         problem.commit()
         assert contact.n_unpaired == 0
-        assert close(contact.resultants().normal_force, depth, 1e-4)
+        assert is_close(contact.resultants().normal_force, depth, 1e-4)
 
 
 # ---- points without an opposite point ------------------------------------------------------------
@@ -236,10 +239,10 @@ def test_soft_contact_keeps_its_pairs():
 def overhang(cell, law, *, tags=(LOWER,), gap=-0.01, **options):
     """Set up a slab of width 1 on a pillar of 0.6, both clamped, with an interference of 0.01."""
     body = stack(cell, (5, 8), (0.5, 0.25), widths=[0.6, 1.0], nu=0.3)
-    body.hold(FLOOR, *range(body.d))
+    body.prescribe(FLOOR, *range(body.d))
     body.lift = body.constant(0.0)
-    body.hold(ROOF, *range(body.d - 1))
-    body.hold(ROOF, body.d - 1, value=body.lift)
+    body.prescribe(ROOF, *range(body.d - 1))
+    body.prescribe(ROOF, body.d - 1, value=body.lift)
     contact = joint(body, 1, law, gap=gap, **options)
     outside = np.any(np.abs(contact.gather()["x"][:, : body.d - 1] - 0.5) > 0.3, axis=1)
     assert 0 < contact.n_unpaired == np.count_nonzero(outside)
@@ -284,10 +287,10 @@ def test_prescribed_gap_at_an_overhang(cell, name, enforcement):
         r = step.contacts["joint 1"]
         obstacle = reaction(body, ROOF)
         assert np.abs(obstacle).max() > 1.0
-        assert close(r.force, -obstacle, 1e-7)
-        assert close(reaction(body, FLOOR), -obstacle, 1e-7)
+        assert is_close(r.force, -obstacle, 1e-7)
+        assert is_close(reaction(body, FLOOR), -obstacle, 1e-7)
         points = contact.gather()
-        assert close(points["measure"] @ points["pressure"], r.normal_force, 1e-12)
+        assert is_close(points["measure"] @ points["pressure"], r.normal_force, 1e-12)
         assert np.all(points["pressure"][outside] == 0.0)
         assert np.all(points["tangential_traction"][outside] == 0.0)
         assert np.all(points["status"][outside] == fc.Status.OPEN)
@@ -296,7 +299,7 @@ def test_prescribed_gap_at_an_overhang(cell, name, enforcement):
         opposed = points["measure"][~outside].sum()
         assert r.area <= opposed * (1 + 1e-12)
         if law.has_tension:
-            assert close(r.area, opposed, 1e-12)
+            assert is_close(r.area, opposed, 1e-12)
         energy = step.energy
         size = abs(energy.work) + abs(energy.elastic) + 1e-12
         assert abs(energy.imbalance) <= 1e-6 * size
@@ -313,11 +316,11 @@ def test_files_mark_points_without_an_opposite_point(cell, tmp_path):
     problem = body.problem(contact)
     problem.solve()
     fc.Writer(folder, problem).write(1)
-    points = vtu.read(folder / "joint 1_points_0000.vtu").at_nodes
+    points = vtu.read_vtu(folder / "joint 1_points_0000.vtu").at_nodes
     alone = points["paired"][:, 0] == 0.0
     assert np.count_nonzero(alone) == np.count_nonzero(outside)
     assert np.array_equal(np.isnan(points["gap"][:, 0]), alone)
-    facets = vtu.read(folder / "joint 1_0000.vtu")
+    facets = vtu.read_vtu(folder / "joint 1_0000.vtu")
     share = facets.in_cells["paired"]
     assert np.array_equal(np.isnan(facets.at_nodes["gap"]).all(axis=1), share == 0.0)
     assert np.isfinite(facets.at_nodes["gap"][share > 0.0]).all()
@@ -342,14 +345,19 @@ def test_warning_states_number_and_cause_of_unpaired_points():
         [np.linspace(0, 1, 9), np.linspace(0, 0.5, 3)],
         [np.linspace(0, 1, 9), np.linspace(0.6, 1, 3)],
     ]
-    sides = {LOWER: near(1, 0.5), UPPER: near(1, 0.6), ROOF: near(1, 1.0), FLOOR: near(1, 0.0)}
+    sides = {
+        LOWER: at_coordinate(1, 0.5),
+        UPPER: at_coordinate(1, 0.6),
+        ROOF: at_coordinate(1, 1.0),
+        FLOOR: at_coordinate(1, 0.0),
+    }
     body = Bodies(boxes(axes, sides), E, 0.3)
     law = fc.Frictionless(1e6)
 
     def made(here, there, **options):
         return body.contact(here, fc.DeformableBody(body.tags, there, **options), law)
 
-    with _told(False):
+    with _assert_warning(False):
         assert made(UPPER, LOWER).n_unpaired == 0
     for here, there, options, word in (
         (UPPER, LOWER, {"search_distance": 0.05}, "search_distance"),
@@ -357,7 +365,7 @@ def test_warning_states_number_and_cause_of_unpaired_points():
         (LOWER, ROOF, {}, "do not meet"),
         (ROOF, FLOOR, {}, "behind"),
     ):
-        with _told(True, "16 of the 16 points", word):
+        with _assert_warning(True, "16 of the 16 points", word):
             assert made(here, there, **options).n_unpaired == 16
 
 
@@ -370,7 +378,7 @@ def undetected(step):
     return [each.failure for each in conditions if not each.holds]
 
 
-def indented(cell, width, depth, *, coarse=2, swap=False, both=False, raised=0.0, fine=2):
+def indented_block(cell, width, depth, *, coarse=2, swap=False, both=False, raised=0.0, fine=2):
     """Set up a block with ``coarse`` cells at its top, and a narrow indenter above a facet.
 
     Γc has two points along a side of a facet, however small the opposite facets are.
@@ -385,16 +393,16 @@ def indented(cell, width, depth, *, coarse=2, swap=False, both=False, raised=0.0
     ]
     low, high = 0.5, 0.5 + raised
     sides = {
-        FLOOR: near(d - 1, 0),
-        LOWER: between(d - 1, low, above=False),
-        UPPER: between(d - 1, high, above=True),
-        ROOF: near(d - 1, high + width),
+        FLOOR: at_coordinate(d - 1, 0),
+        LOWER: at_interface(d - 1, low, above=False),
+        UPPER: at_interface(d - 1, high, above=True),
+        ROOF: at_coordinate(d - 1, high + width),
     }
     body = Bodies(boxes(axes, sides, simplex=cell == "triangle"), E, 0.3)
-    body.hold(FLOOR, *range(d))
+    body.prescribe(FLOOR, *range(d))
     down = body.constant(-depth)
-    body.hold(ROOF, *range(d - 1))
-    body.hold(ROOF, d - 1, value=down)
+    body.prescribe(ROOF, *range(d - 1))
+    body.prescribe(ROOF, d - 1, value=down)
     faces = [(UPPER, LOWER)] if swap else [(LOWER, UPPER)]
     faces += [(UPPER, LOWER)] if both else []
     contacts = [
@@ -410,17 +418,19 @@ def test_undetected_narrow_indenter_is_refused(cell):
 
     With surfaces swapped, or Γc on both sides, contact forces balance the reaction, 1e-7.
     """
-    body, contacts, problem = indented(cell, 0.05, 1e-3)
-    text = raised_everywhere(problem.solve, fc.NotConverged, "penetrates", "swapped", "side 0")
+    body, contacts, problem = indented_block(cell, 0.05, 1e-3)
+    text = assert_raised_on_all_ranks(
+        problem.solve, fc.NotConverged, "penetrates", "swapped", "side 0"
+    )
     assert "1.000e-03" in text
     assert contacts[0].resultants().normal_force == 0.0
     for options in ({"swap": True}, {"both": True}):
-        body, contacts, problem = indented(cell, 0.05, 1e-3, **options)
+        body, contacts, problem = indented_block(cell, 0.05, 1e-3, **options)
         step = problem.solve()
         assert undetected(step) == []
         assert sum(r.normal_force for r in step.contacts.values()) > 1.0
         total = sum(r.normal_force for r in step.contacts.values())
-        assert close(-total, reaction(body, ROOF)[body.d - 1], 1e-7)
+        assert is_close(-total, reaction(body, ROOF)[body.d - 1], 1e-7)
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
@@ -437,23 +447,23 @@ def test_obstacle_split_into_several_contacts(kinematics, cells):
     for tags in ([[LOWER, BOTH]], [[LOWER], [BOTH]]):
         slabs = [[np.linspace(*ends, 4), np.array([0, 0.5])] for ends in ((0, 1.5), (1.6, 2.1))]
         sides = {
-            FLOOR: near(1, 0),
-            BOTH: between(1, 0.5, above=False),
-            LOWER: lambda x, cell: between(1, 0.5, above=False)(x, cell) & (x[:, 0] < 1.55),
-            UPPER: between(1, 0.5, above=True),
-            ROOF: near(1, 1.1),
+            FLOOR: at_coordinate(1, 0),
+            BOTH: at_interface(1, 0.5, above=False),
+            LOWER: lambda x, cell: at_interface(1, 0.5, above=False)(x, cell) & (x[:, 0] < 1.55),
+            UPPER: at_interface(1, 0.5, above=True),
+            ROOF: at_coordinate(1, 1.1),
         }
         body = Bodies(boxes([*slabs, lines], sides), E, 0.3)
-        body.hold(FLOOR, 0, 1)
-        body.hold(ROOF, 0)
-        body.hold(ROOF, 1, value=-0.01)
+        body.prescribe(FLOOR, 0, 1)
+        body.prescribe(ROOF, 0)
+        body.prescribe(ROOF, 1, value=-0.01)
         contacts = [
             body.contact(UPPER, tag, fc.Frictionless(), kinematics=kinematics, name=f"slab {i}")
             for i, tag in enumerate(tags)
         ]
         problem = body.problem(*contacts)
         if cells == 6:
-            raised_everywhere(problem.solve, fc.NotConverged, "penetrates")
+            assert_raised_on_all_ranks(problem.solve, fc.NotConverged, "penetrates")
             continue
         step = problem.solve()
         assert undetected(step) == []
@@ -471,30 +481,32 @@ def test_undetected_pin_between_slabs_is_refused(kinematics):
     axes = [[np.linspace(*ends, n), high] for ends, n in zip(edges, (5, 5, 3), strict=True)]
     axes += [[np.linspace(0.5, 1.5, 5), 0.5 + high]]
     sides = {
-        FLOOR: near(1, 0),
-        LOWER: between(1, 0.5, above=False),
-        BOTH: lambda x, cell: between(1, 0.5, above=False)(x, cell) & (abs(x[:, 0] - 1) < width),
-        UPPER: between(1, 0.5, above=True),
-        ROOF: near(1, 1),
+        FLOOR: at_coordinate(1, 0),
+        LOWER: at_interface(1, 0.5, above=False),
+        BOTH: lambda x, cell: (
+            at_interface(1, 0.5, above=False)(x, cell) & (abs(x[:, 0] - 1) < width)
+        ),
+        UPPER: at_interface(1, 0.5, above=True),
+        ROOF: at_coordinate(1, 1),
     }
     body = Bodies(boxes(axes, sides), E, 0.3)
-    body.hold(FLOOR, 0, 1)
-    body.hold(ROOF, 0)
-    body.hold(ROOF, 1, value=-0.01)
+    body.prescribe(FLOOR, 0, 1)
+    body.prescribe(ROOF, 0)
+    body.prescribe(ROOF, 1, value=-0.01)
     contacts = [
         body.contact(UPPER, tag, fc.Frictionless(), quadrature=2, kinematics=kinematics, name=name)
         for name, tag in (("slabs", LOWER), ("pin", BOTH))
     ]
     problem = body.problem(*contacts)
-    raised_everywhere(problem.solve, fc.NotConverged, "pin: the obstacle penetrates")
+    assert_raised_on_all_ranks(problem.solve, fc.NotConverged, "pin: the obstacle penetrates")
 
 
 def test_penetration_tolerance_of_the_verdict():
     """Penetration fails once the gap is closed, above a fiftieth of the smaller facet, 5e-4."""
     for depth, fails in ((0.0, False), (9e-4, False), (1.4e-3, False), (1.6e-3, True)):
-        *_, problem = indented("triangle", 0.05, depth, raised=1e-3)
+        *_, problem = indented_block("triangle", 0.05, depth, raised=1e-3)
         if fails:
-            raised_everywhere(problem.solve, fc.NotConverged, "penetrates")
+            assert_raised_on_all_ranks(problem.solve, fc.NotConverged, "penetrates")
         else:
             assert undetected(problem.solve()) == []
 
@@ -505,8 +517,8 @@ def test_penetration_tolerance_of_the_verdict():
 def test_any_ratio_of_mesh_sizes_is_verified(counts, swap):
     """Blocks pressed eccentrically, so that one side opens: no undetected penetration."""
     body = stack("quadrilateral", counts, (0.5, 0.5), nu=0.3)
-    body.hold(FLOOR, 0, 1)
-    body.hold(ROOF, 0)
+    body.prescribe(FLOOR, 0, 1)
+    body.prescribe(ROOF, 0)
     top = fem.Function(body.u.function_space.sub(1).collapse()[0])
     spaces = body.u.function_space.sub(1), top.function_space
     dofs = fem.locate_dofs_topological(spaces, 1, body.tags.find(ROOF))
@@ -527,7 +539,7 @@ def test_any_ratio_of_mesh_sizes_is_verified(counts, swap):
 def test_faceting_of_curved_surfaces_is_accepted(counts, swap, degree):
     """Overlapping facets of rings of straight or curved cells pass the verdict, loaded or not."""
     body = rings(counts, degree=degree)
-    body.hold(FLOOR, 0, 1)
+    body.prescribe(FLOOR, 0, 1)
     squeeze = body.constant(0.0)
     body.F += squeeze * ufl.dot(ufl.FacetNormal(body.mesh), body.v) * body.ds(OUTSIDE)
     here, there = (UPPER, LOWER) if swap else (LOWER, UPPER)
@@ -561,12 +573,12 @@ def test_true_gap_of_a_rotated_block(cell):
         arm = x[:d] - pivot[:, None]
         return turn @ arm - arm + lift * np.eye(d)[:, -1:]
 
-    body.displace(moved, lambda x: x[:, -1] > 0.5)
+    body.set_displacement(moved, lambda x: x[:, -1] > 0.5)
     x = contact.points
     gap, normal = contact.true_placement()
     assert contact.pairs.n_updates == 1
-    assert close(normal, np.tile(-turn[:, -1], (len(normal), 1)), 1e-12, scale=1.0)
+    assert is_close(normal, np.tile(-turn[:, -1], (len(normal), 1)), 1e-12, scale=1.0)
     assert COMM.allreduce(np.count_nonzero(np.isnan(gap))) == 0
     height = (x + moved(x.T).T)[:, -1] - 0.5
-    assert close(gap, height / np.cos(angle), 1e-12, scale=1.0)
+    assert is_close(gap, height / np.cos(angle), 1e-12, scale=1.0)
     assert COMM.allreduce(np.abs(contact.gap - gap).max(initial=0.0), op=MPI.MAX) > 1e-3

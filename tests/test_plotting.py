@@ -9,9 +9,14 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact import plotting
 from fenics_contact.results import drawing
+from scenes.block_on_ball import BlockOnBall
 from scenes.blocks import CELLS, dimension
-from scenes.comparing import close, on_first, raised_everywhere, shared_folder
-from scenes.rubbing import Rub
+from scenes.comparison import (
+    assert_raised_on_all_ranks,
+    check_on_first_rank,
+    is_close,
+    shared_folder,
+)
 
 matplotlib = pytest.importorskip("matplotlib")
 COMM = MPI.COMM_WORLD
@@ -41,7 +46,7 @@ def test_pictures_of_pressure_status_and_deformation(cell, tmp_path, drawn):
     Axes have units, and displacements are magnified.
     """
     folder, d = shared_folder(tmp_path), dimension(cell)
-    made = Rub(cell=cell, mesh={"n": 4})
+    made = BlockOnBall(cell=cell, mesh={"n": 4})
     made.problem.small_displacement_tolerance = np.inf
     (step,) = fc.increments(made.problem, made.load, 0, 2, steps=1)
     plotting.plot_pressure(folder / "p.png", made.contact, length="m", stress="Pa", title="Title")
@@ -63,7 +68,7 @@ def test_pictures_of_pressure_status_and_deformation(cell, tmp_path, drawn):
         assert len(shapes(body)) == n_shapes and len(shapes(surface)) == n_facets
         # The colour scale ends at the largest mean, and all loaded facets are coloured.
         by_facet = per_facet(points, cell)
-        assert close(pressure.axes[1].get_ylim(), [0.0, by_facet.max()], 1e-12)
+        assert is_close(pressure.axes[1].get_ylim(), [0.0, by_facet.max()], 1e-12)
         colours = surface.get_facecolor() if d == 3 else surface.get_color()
         grey = matplotlib.colors.to_rgba("#d8d8d8")
         bears = ~np.all(np.isclose(np.asarray(colours), grey), axis=1)
@@ -72,9 +77,9 @@ def test_pictures_of_pressure_status_and_deformation(cell, tmp_path, drawn):
         assert names == ["open", "sticking", "slipping", *["rigid obstacle"] * (d == 2)]
         # Displacements are magnified by 2: the top moves by 0.1 along x and 0.03 down.
         before, after = (np.concatenate(shapes(c)) for c in deformed.axes[0].collections)
-        assert close(before.max(axis=0)[: d - 1], np.ones(d - 1), 1e-12)
-        assert close([after[:, 0].max()], [1.2], 1e-9)
-        assert close([after[:, -1].max()], [1 - 0.06], 1e-9)
+        assert is_close(before.max(axis=0)[: d - 1], np.ones(d - 1), 1e-12)
+        assert is_close([after[:, 0].max()], [1.2], 1e-9)
+        assert is_close([after[:, -1].max()], [1 - 0.06], 1e-9)
         outline = shapes(deformed.axes[0].collections[0])
         if d == 2:
             assert len(outline[0]) in (CORNERS[cell], CORNERS[cell] + 1)
@@ -84,7 +89,7 @@ def test_pictures_of_pressure_status_and_deformation(cell, tmp_path, drawn):
             assert (folder / name).read_bytes()[:4] == b"\x89PNG"
 
     assert step.contacts["contact"].normal_force > 0
-    on_first(check)
+    check_on_first_rank(check)
 
 
 @pytest.mark.parametrize("cell", CELLS)
@@ -94,7 +99,7 @@ def test_pictures_of_fields_and_stress(cell, tmp_path, drawn):
     The stress is E ε along x, where the strain ε is proportional to x.
     """
     folder, d = shared_folder(tmp_path), dimension(cell)
-    made = Rub(cell=cell, mesh={"n": 4})
+    made = BlockOnBall(cell=cell, mesh={"n": 4})
     made.problem.small_displacement_tolerance = np.inf
     list(fc.increments(made.problem, made.load, 0, 2, steps=2))
     fields = ("pressure", "friction", "gap", "slip")
@@ -103,10 +108,10 @@ def test_pictures_of_fields_and_stress(cell, tmp_path, drawn):
     if d == 2:
         plotting.plot_along(folder / "along.png", made.contact)
     else:
-        raised_everywhere(
+        assert_raised_on_all_ranks(
             lambda: plotting.plot_along(folder / "a.png", made.contact), ValueError, "plot_field"
         )
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: plotting.plot_field(folder / "a.png", made.contact, "heat"), ValueError, "'heat'"
     )
     points = made.contact.gather()
@@ -117,7 +122,7 @@ def test_pictures_of_fields_and_stress(cell, tmp_path, drawn):
     rows = [[1000 * u[0].dx(0), zero, zero], [zero, zero, zero], [zero, zero, zero]]
     plotting.plot_deformation(folder / "u.png", u, stress=ufl.as_tensor(rows))
     tensor = ufl.as_tensor(rows)[0, 0]
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: plotting.plot_deformation(folder / "a.png", u, stress=tensor), ValueError, "(3, 3)"
     )
 
@@ -125,7 +130,7 @@ def test_pictures_of_fields_and_stress(cell, tmp_path, drawn):
         for field, figure in zip(fields, drawn, strict=False):
             means = per_facet(points | {"pressure": points[field]}, cell)
             ends = [min(0.0, means.min()), max(0.0, means.max())]
-            assert close(figure.axes[1].get_ylim(), ends, 1e-12), field
+            assert is_close(figure.axes[1].get_ylim(), ends, 1e-12), field
             grey = field != "gap" and bool(np.any(means == 0.0))
             assert entries(figure)[d == 2 :] == ([f"no {field}"] if grey else [])
         if d == 2:
@@ -140,10 +145,10 @@ def test_pictures_of_fields_and_stress(cell, tmp_path, drawn):
         # The colour scale ends at the stress in the midpoints of the last cells along x.
         body = drawn[-1].axes[0].collections[1]
         largest = {"triangle": 11 / 12, "tetrahedron": 15 / 16}.get(cell, 7 / 8)
-        assert close(drawn[-1].axes[1].get_ylim(), [0, 100 * largest], 1e-9)
+        assert is_close(drawn[-1].axes[1].get_ylim(), [0, 100 * largest], 1e-9)
         assert len(np.unique(np.asarray(body.get_facecolor()), axis=0)) >= 4
 
-    on_first(check)
+    check_on_first_rank(check)
 
 
 def entries(figure):
@@ -175,31 +180,33 @@ def per_facet(points, cell):
 
 def test_missing_folder_is_refused(tmp_path):
     """All ranks raise the error of the first rank, without a picture."""
-    made = Rub()
+    made = BlockOnBall()
     path = shared_folder(tmp_path) / "no" / "p.png"
     for call in (
         lambda: plotting.plot_pressure(path, made.contact),
         lambda: plotting.plot_deformation(path, made.scene.u),
     ):
-        raised_everywhere(call, OSError, "no")
+        assert_raised_on_all_ranks(call, OSError, "no")
 
 
 def test_wrong_displacements_are_refused(tmp_path):
     """The error is raised by the package, not by DOLFINx."""
-    u = Rub().scene.u
+    u = BlockOnBall().scene.u
     scalar = fem.Function(fem.functionspace(u.function_space.mesh, ("Lagrange", 1)))
     path = shared_folder(tmp_path) / "u.png"
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: plotting.plot_deformation(path, scalar), ValueError, "shape ()", "contact.u"
     )
-    raised_everywhere(lambda: plotting.plot_deformation(path, "u"), ValueError, "u is a str")
+    assert_raised_on_all_ranks(
+        lambda: plotting.plot_deformation(path, "u"), ValueError, "u is a str"
+    )
 
 
 @pytest.mark.parametrize("cell", CELLS)
 def test_near_restricts_pictures_to_the_contact(cell, tmp_path, drawn):
     """All loaded facets are drawn, and nothing beyond ``near`` of them, unless it is None."""
     folder, d = shared_folder(tmp_path), dimension(cell)
-    made = Rub(cell=cell, mesh={"n": 8 if d == 2 else 4})
+    made = BlockOnBall(cell=cell, mesh={"n": 8 if d == 2 else 4})
     made.problem.small_displacement_tolerance = np.inf
     list(fc.increments(made.problem, made.load, 0, 1, steps=1))
     points = made.contact.gather()
@@ -208,7 +215,7 @@ def test_near_restricts_pictures_to_the_contact(cell, tmp_path, drawn):
         plotting.plot_pressure(folder / "p.png", made.contact, near=near)
         plotting.plot_status(folder / "s.png", made.contact, near=near)
     for near in (0.0, -1.0, np.nan, "near"):
-        raised_everywhere(
+        assert_raised_on_all_ranks(
             lambda near=near: plotting.plot_status(folder / "a.png", made.contact, near=near),
             ValueError,
             "length greater than zero",
@@ -228,4 +235,4 @@ def test_near_restricts_pictures_to_the_contact(cell, tmp_path, drawn):
             low, high = bearing.min(axis=0) - reach, bearing.max(axis=0) + reach
             assert np.all((middles >= low - 1e-12) & (middles <= high + 1e-12))
 
-    on_first(check)
+    check_on_first_rank(check)

@@ -10,8 +10,8 @@ import pytest
 from mpi4py import MPI
 
 import fenics_contact as fc
-from scenes.comparing import raised_everywhere
-from scenes.sound import coulomb, pressed
+from scenes.comparison import assert_raised_on_all_ranks
+from scenes.valid_problem import coulomb_law, pressed_block
 
 pytest.importorskip("tqdm")
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
@@ -49,8 +49,8 @@ def terminal_of(monkeypatch: pytest.MonkeyPatch) -> Terminal:
 
 def history(ends: list[float], scene=None, **options) -> fc.Step:
     """Return the increments of a pressed block with its modulus as the load."""
-    scene = scene or pressed()
-    problem, _ = scene.problem(coulomb(), scene.rollers())
+    scene = scene or pressed_block()
+    problem, _ = scene.problem(coulomb_law(), scene.rollers())
     start = float(scene.E.value)
     steps = [start * end for end in ends]
     return fc.increments(problem, scene.E, start, steps[-1], steps=steps, **options)
@@ -79,11 +79,11 @@ def test_no_bar_without_a_terminal_or_by_default(monkeypatch):
 
 def test_invalid_progress_is_refused():
     """`progress` is neither a text nor a bool: the error states its value."""
-    raised_everywhere(lambda: history([1.1], progress=3), ValueError, "progress is 3")
+    assert_raised_on_all_ranks(lambda: history([1.1], progress=3), ValueError, "progress is 3")
 
 
 def test_missing_tqdm_is_reported(monkeypatch):
     """Without tqdm `progress=True` raises an error that names it on all ranks."""
     monkeypatch.setitem(sys.modules, "tqdm", None)
-    raised_everywhere(lambda: history([1.1], progress=True), ValueError, "tqdm")
+    assert_raised_on_all_ranks(lambda: history([1.1], progress=True), ValueError, "tqdm")
     list(history([1.1]))

@@ -10,12 +10,12 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.results import drawing
+from scenes.block_on_ball import BlockOnBall
 from scenes.blocks import block
-from scenes.comparing import close, raised_everywhere, shared_folder
+from scenes.comparison import assert_raised_on_all_ranks, is_close, shared_folder
 from scenes.elasticity import stress
-from scenes.histories import Press, Ramp
-from scenes.rubber import Tool
-from scenes.rubbing import Rub
+from scenes.histories import BlockOnBallHistory, BlockOnRamp
+from scenes.rubber import DiscOnRubber
 
 pytest.importorskip("matplotlib")
 COMM = MPI.COMM_WORLD
@@ -138,7 +138,7 @@ def test_report_of_a_restarted_history(tmp_path, curves):
     kept = {"checkpoint": folder / "state.npz", "csv": folder / "history.csv"}
 
     def press():
-        return Press(wall=True, contact={"enforcement": "augmented"})
+        return BlockOnBallHistory(wall=True, contact={"enforcement": "augmented"})
 
     steps = []
     for step in press().increments(3.0, **kept):
@@ -172,24 +172,24 @@ def test_report_of_a_restarted_history(tmp_path, curves):
     for n, name in enumerate(("floor", "wall")):
         for i, axis in enumerate("xy"):
             x, y = drawn(curves, ("force on the body [kN/m]", f"force {axis}"), n)
-            assert close(x, loads, 1e-14)
-            assert close(y, [step.contacts[name].force[i] for step in steps], 1e-14)
+            assert is_close(x, loads, 1e-14)
+            assert is_close(y, [step.contacts[name].force[i] for step in steps], 1e-14)
         x, y = drawn(curves, ("moment about the origin [kN m/m]", "moment z"), n)
-        assert close(y, [step.contacts[name].moment[0] for step in steps], 1e-14)
+        assert is_close(y, [step.contacts[name].moment[0] for step in steps], 1e-14)
         x, y = drawn(curves, ("area [m²/m]", "stick"), n)
-        assert close(y, [step.contacts[name].extents["stick"].area for step in steps], 1e-14)
+        assert is_close(y, [step.contacts[name].extents["stick"].area for step in steps], 1e-14)
     x, y = drawn(curves, ("energy [kN m/m]", "dissipation by friction"))
-    assert close(y, np.cumsum([step.energy.dissipation for step in steps]), 1e-14)
+    assert is_close(y, np.cumsum([step.energy.dissipation for step in steps]), 1e-14)
     # At the points near the contact: the values of `gather`.
     points = made.problem.contacts[0].gather()
     x, y = drawn(curves, ("traction [kPa]", "pressure"))
-    assert close([y.max()], [points["pressure"].max()], 1e-14)
+    assert is_close([y.max()], [points["pressure"].max()], 1e-14)
     assert set(x) <= set(points["x"][:, 0])
 
 
 def space():
     """Return the problem, steps and stress of a block in space."""
-    made = Rub(cell="tetrahedron")
+    made = BlockOnBall(cell="tetrahedron")
     made.problem.small_displacement_tolerance = np.inf
     steps = list(fc.increments(made.problem, made.load, 0, 2, steps=2))
     return made.problem, steps, stress(made.scene.u, made.scene.E, made.scene.nu)
@@ -197,21 +197,21 @@ def space():
 
 def bodies():
     """Return the problem and steps of two bodies whose pairs are updated."""
-    made = Ramp()
+    made = BlockOnRamp()
     return made.problem, list(made.increments(1.0)), None
 
 
 def finite():
     """Return the problem and steps of rubber under a disc with large displacements."""
-    made = Tool()
+    made = DiscOnRubber()
     return made.problem, list(made.increments(1.0)), None
 
 
 def alone():
     """Return the problem and one step without a load parameter, not committed."""
-    made = Rub(fc.Coulomb(0.3))
+    made = BlockOnBall(fc.Coulomb(0.3))
     made.problem.small_displacement_tolerance = np.inf
-    made.move(0.01, 0.03)
+    made.set_top_displacement(0.01, 0.03)
     return made.problem, made.problem.solve(), None
 
 
@@ -226,9 +226,9 @@ def test_report_of_every_kind_of_problem(scene, tmp_path, curves):
     per = "/mm" if problem.contacts[0].points.shape[1] == 2 else ""
     force = drawn(curves, (f"force on the body [N{per}]", "force y"))
     name = problem.contacts[0].name
-    assert close(force[1], [step.contacts[name].force[1] for step in steps], 1e-14)
+    assert is_close(force[1], [step.contacts[name].force[1] for step in steps], 1e-14)
     loads = [step.increment if step.load is None else step.load for step in steps]
-    assert close(force[0], loads, 1e-14)
+    assert is_close(force[0], loads, 1e-14)
 
 
 def test_report_of_an_unloaded_body(tmp_path):
@@ -266,7 +266,7 @@ def test_report_of_an_unloaded_body(tmp_path):
 def test_invalid_input_is_refused(tmp_path):
     """Invalid input is refused on all ranks, before any work; no report is written."""
     folder = shared_folder(tmp_path)
-    made = Rub()
+    made = BlockOnBall()
     made.problem.small_displacement_tolerance = np.inf
     first, step = fc.increments(made.problem, made.load, 0, 1, steps=2, csv=folder / "history.csv")
     problem, page = made.problem, folder / "page"
@@ -299,10 +299,16 @@ def test_invalid_input_is_refused(tmp_path):
         (("magnification is -1",), (problem, step, page), {"magnification": -1}),
         (("view is (1, 2, 3)",), (problem, step, page), {"view": (1, 2, 3)}),
     ):
-        raised_everywhere(lambda a=arguments, o=options: fc.report(*a, **o), ValueError, *words)
+        assert_raised_on_all_ranks(
+            lambda a=arguments, o=options: fc.report(*a, **o), ValueError, *words
+        )
     missing = folder / "missing.csv"
-    raised_everywhere(lambda: fc.report(problem, step, page, csv=missing), OSError, "missing.csv")
-    raised_everywhere(lambda: fc.report(problem, step, folder / "other.csv"), OSError, "other.csv")
+    assert_raised_on_all_ranks(
+        lambda: fc.report(problem, step, page, csv=missing), OSError, "missing.csv"
+    )
+    assert_raised_on_all_ranks(
+        lambda: fc.report(problem, step, folder / "other.csv"), OSError, "other.csv"
+    )
     COMM.barrier()
     assert not (page / "report.html").exists()
 
@@ -310,7 +316,7 @@ def test_invalid_input_is_refused(tmp_path):
 def test_failure_keeps_the_previous_report(tmp_path, monkeypatch):
     """If a picture cannot be drawn, all ranks raise the error, and the report is unchanged."""
     folder = shared_folder(tmp_path)
-    made = Rub()
+    made = BlockOnBall()
     made.problem.small_displacement_tolerance = np.inf
     (step,) = fc.increments(made.problem, made.load, 0, 1)
     path = fc.report(made.problem, step, folder)
@@ -321,6 +327,8 @@ def test_failure_keeps_the_previous_report(tmp_path, monkeypatch):
         raise OSError("no more ink")
 
     monkeypatch.setattr(drawing, "save", failing)
-    raised_everywhere(lambda: fc.report(made.problem, step, folder), OSError, "no more ink")
+    assert_raised_on_all_ranks(
+        lambda: fc.report(made.problem, step, folder), OSError, "no more ink"
+    )
     COMM.barrier()
     assert path.read_bytes() == before and [p.name for p in folder.iterdir()] == ["report.html"]

@@ -20,12 +20,23 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact import checkpoint
+from scenes.block_on_ball import BlockOnBall
 from scenes.blocks import TOP, block
-from scenes.comparing import at_points, close, owned, raised_everywhere, shared_folder
+from scenes.comparison import (
+    assert_raised_on_all_ranks,
+    is_close,
+    owned_values,
+    point_values,
+    shared_folder,
+)
 from scenes.elasticity import strain
-from scenes.histories import Press, Ramp, differences, goes_on
-from scenes.processes import command, environment
-from scenes.rubbing import Rub
+from scenes.histories import (
+    BlockOnBallHistory,
+    BlockOnRamp,
+    assert_restart_equals_uninterrupted,
+    find_differences,
+)
+from scenes.processes import command, subprocess_environment
 
 COMM = MPI.COMM_WORLD
 
@@ -44,13 +55,13 @@ def test_restart_with_updated_pairs(cell, condensation, update, stop, tmp_path):
 
     By default pairs are updated only after the block has slid: interrupted before and after that.
     """
-    make = lambda: Ramp(  # noqa: E731
+    make = lambda: BlockOnRamp(  # noqa: E731
         cell=cell,
         condensation=condensation,
         update_pairs=update,
         n=(10, 4) if cell == "quadrilateral" else (6, 2),
     )
-    goes_on(make, shared_folder(tmp_path), stop=stop)
+    assert_restart_equals_uninterrupted(make, shared_folder(tmp_path), stop=stop)
 
 
 LAWS = {
@@ -93,8 +104,8 @@ def products() -> list[tuple]:
 
 @pytest.mark.each
 @pytest.mark.newest
-@pytest.mark.parametrize(("obstacle", "law", "how", "method", "extra"), products())
-def test_restart_of_combined_options(obstacle, law, how, method, extra, tmp_path):
+@pytest.mark.parametrize(("obstacle", "law", "variant", "method", "extra"), products())
+def test_restart_of_combined_options(obstacle, law, variant, method, extra, tmp_path):
     """Restarts agree for combined obstacles, laws, enforcement, methods and history options."""
     options = {}
     if extra == "estimate":
@@ -105,10 +116,10 @@ def test_restart_of_combined_options(obstacle, law, how, method, extra, tmp_path
         options |= {"checkpoint_every": 3}
 
     def make():
-        contact = dict(HOW[how])
+        contact = dict(HOW[variant])
         if obstacle == "ramp":
-            return Ramp(LAWS[law](), contact=contact, method=method)
-        return Press(
+            return BlockOnRamp(LAWS[law](), contact=contact, method=method)
+        return BlockOnBallHistory(
             LAWS[law](),
             cell="hexahedron" if law == "polygon" else "triangle",
             n=2 if law == "polygon" else 4,
@@ -121,11 +132,13 @@ def test_restart_of_combined_options(obstacle, law, how, method, extra, tmp_path
         )
 
     # A preset solves to 1e-2 of its error, multipliers to a fraction of the tractions.
-    tolerance = {"draft": 5e-3, "standard": 1e-3, "augmented": 1e-4}.get(how, 1e-6)
-    goes_on(make, shared_folder(tmp_path), stop=5, tolerance=tolerance, **options)
+    tolerance = {"draft": 5e-3, "standard": 1e-3, "augmented": 1e-4}.get(variant, 1e-6)
+    assert_restart_equals_uninterrupted(
+        make, shared_folder(tmp_path), stop=5, tolerance=tolerance, **options
+    )
 
 
-@pytest.mark.parametrize("make", [Press, Ramp])
+@pytest.mark.parametrize("make", [BlockOnBallHistory, BlockOnRamp])
 def test_restart_after_cut_increments(make, tmp_path):
     """Cut increments and their later growth are part of the stored position in the load path.
 
@@ -154,14 +167,14 @@ def test_restart_after_cut_increments(make, tmp_path):
 
         made.load, problem.solve, problem.commit = note, choosy, keep
 
-    goes_on(make, shared_folder(tmp_path), stop=5, tamper=tamper)
+    assert_restart_equals_uninterrupted(make, shared_folder(tmp_path), stop=5, modify=tamper)
 
 
 def test_error_estimate_of_a_restarted_state(tmp_path):
     """The error budget of a restarted history is that of the run that solved it (1e-6)."""
     path, budgets = shared_folder(tmp_path) / "state.npz", []
     for condensation in (True, True, False):
-        made = Press(condensation=condensation)
+        made = BlockOnBallHistory(condensation=condensation)
         list(made.increments(checkpoint=path))
         scene = made.scene
         sigma = ufl.variable(strain(scene.u))  # not that of the form, but the same in all runs
@@ -169,7 +182,7 @@ def test_error_estimate_of_a_restarted_state(tmp_path):
         budgets.append(budget.relative("enforcement"))
     for budget in budgets[1:]:
         for name, value in budgets[0].items():
-            assert close(budget[name], value, 1e-6, scale=1.0)
+            assert is_close(budget[name], value, 1e-6, scale=1.0)
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="MUMPS adds in the order in which messages come")
@@ -179,20 +192,20 @@ def test_repeated_histories_are_bit_identical():
     options = {"cell": "triangle", "n": 3, "method": "lbfgs", "contact": HOW["standard"]}
     for n in range(8):
         between.append([np.empty(13 * (n + 1) + i) for i in range(5)])
-        made.append(Press(fc.Tresca(0.3, 20.0), **options))
+        made.append(BlockOnBallHistory(fc.Tresca(0.3, 20.0), **options))
         list(made[-1].increments(1.0))
     for again in made[1:]:
-        assert differences(again, made[0], 0.0) == []
+        assert find_differences(again, made[0], 0.0) == []
 
 
 SCRIPT = """
 import json
-from scenes.histories import Press, Ramp, picture
+from scenes.histories import BlockOnBallHistory, BlockOnRamp, collect_state
 made = {scene}
 for step in made.increments(checkpoint={path!r}):
     if step.increment == {stop}:
         break
-found = picture(made)
+found = collect_state(made)
 names = [n for n in found if n.split()[-1] in ("u", "history", "jump", "forces", "counts")]
 if made.problem.u.function_space.mesh.comm.rank == 0:
     print(json.dumps({{n: found[n].tolist() for n in names}}))
@@ -203,7 +216,9 @@ def run_script(ranks: int, **values) -> dict[str, np.ndarray]:
     """Run a history in a process of its own and return its final values."""
     script = SCRIPT.format(**values)
     words = command(ranks, "-c", script)
-    done = subprocess.run(words, env=environment(), capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        words, env=subprocess_environment(), capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stderr
     return {n: np.array(v) for n, v in json.loads(done.stdout.splitlines()[-1]).items()}
 
@@ -212,10 +227,10 @@ def run_script(ranks: int, **values) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     ("scene", "ranks"),
     [
-        ("Ramp(n=(6, 2))", (1, 2)),
-        pytest.param("Ramp(n=(6, 2))", (2, 3), marks=pytest.mark.slow),
-        ("Press(obstacle='force', contact={'enforcement': 'augmented'})", (2, 1)),
-        ("Press(cell='tetrahedron', n=2, wall=True, obstacle='moving')", (2, 1)),
+        ("BlockOnRamp(n=(6, 2))", (1, 2)),
+        pytest.param("BlockOnRamp(n=(6, 2))", (2, 3), marks=pytest.mark.slow),
+        ("BlockOnBallHistory(obstacle='force', contact={'enforcement': 'augmented'})", (2, 1)),
+        ("BlockOnBallHistory(cell='tetrahedron', n=2, wall=True, obstacle='moving')", (2, 1)),
     ],
 )
 def test_restart_on_another_number_of_ranks(scene, ranks, tmp_path):
@@ -230,13 +245,13 @@ def test_restart_on_another_number_of_ranks(scene, ranks, tmp_path):
         if name.endswith("counts"):
             assert np.array_equal(after[name], alone[name])
         else:
-            assert close(after[name], alone[name], 1e-4 if "augmented" in scene else 1e-6), name
+            assert is_close(after[name], alone[name], 1e-4 if "augmented" in scene else 1e-6), name
 
 
 # ---- position in the load path -------------------------------------------------------------------
 
 
-def there_and_back(made, path, *, stop=0):
+def load_cycle(made, path, *, stop=0):
     """Load to 2, unload to 1, reload to 2, stop after ``stop`` increments; return the loads."""
     loads = []
     for start, end, steps in ((0.0, 2.0, 4), (2.0, 1.0, 2), (1.0, 2.0, 2)):
@@ -248,38 +263,38 @@ def there_and_back(made, path, *, stop=0):
 
 
 @pytest.mark.parametrize("stop", [1, 4, 5, 7])
-@pytest.mark.parametrize("make", [Press, Ramp])
+@pytest.mark.parametrize("make", [BlockOnBallHistory, BlockOnRamp])
 def test_restart_within_several_calls_of_increments(make, stop, tmp_path):
     """Loading, unloading, reloading with one file are interrupted in and at the end of a call."""
     folder = shared_folder(tmp_path)
     whole, broken, after = make(), make(), make()
-    loads = there_and_back(whole, folder / "whole.npz")
-    there_and_back(broken, folder / "part.npz", stop=stop)
-    assert there_and_back(after, folder / "part.npz") == loads[stop:]
-    assert differences(after, whole, 0.0 if COMM.size == 1 else 1e-7) == []
+    loads = load_cycle(whole, folder / "whole.npz")
+    load_cycle(broken, folder / "part.npz", stop=stop)
+    assert load_cycle(after, folder / "part.npz") == loads[stop:]
+    assert find_differences(after, whole, 0.0 if COMM.size == 1 else 1e-7) == []
 
 
 def test_calls_in_another_order_are_refused(tmp_path):
     """The second call is refused as the first one, and so is a first call with another end."""
     path = shared_folder(tmp_path) / "state.npz"
-    there_and_back(Press(), path, stop=5)
-    made = Press()
+    load_cycle(BlockOnBallHistory(), path, stop=5)
+    made = BlockOnBallHistory()
     call = lambda: next(made.increments(1.0, 2.0, steps=2, checkpoint=path))  # noqa: E731
-    raised_everywhere(call, ValueError, "from 2 to 1 by 2", "from 0 to 2 by 4")
+    assert_raised_on_all_ranks(call, ValueError, "from 2 to 1 by 2", "from 0 to 2 by 4")
     call = lambda: next(made.increments(2.5, 0.0, steps=5, checkpoint=path), None)  # noqa: E731
-    raised_everywhere(call, ValueError, "from 0 to 2.5 by 5", "from 0 to 2 by 4")
+    assert_raised_on_all_ranks(call, ValueError, "from 0 to 2.5 by 5", "from 0 to 2 by 4")
 
 
 def test_restart_with_later_end_or_other_remaining_steps(tmp_path):
     """A finished history is extended as if solved in one run; its remaining steps may differ."""
     folder = shared_folder(tmp_path)
-    first, further, whole = Press(), Press(), Press()
+    first, further, whole = BlockOnBallHistory(), BlockOnBallHistory(), BlockOnBallHistory()
     list(first.increments(2.0, checkpoint=folder / "state.npz"))
     rest = [s.load for s in further.increments(4.0, checkpoint=folder / "state.npz")]
     assert rest == [2.5, 3.0, 3.5, 4.0]
     list(whole.increments(4.0, checkpoint=folder / "whole.npz"))
-    assert differences(further, whole, 0.0 if COMM.size == 1 else 1e-7) == []
-    other = Press()
+    assert find_differences(further, whole, 0.0 if COMM.size == 1 else 1e-7) == []
+    other = BlockOnBallHistory()
     steps = [0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.1]
     rest = [s.load for s in other.increments(4.1, steps=steps, checkpoint=folder / "state.npz")]
     assert rest == [4.1]
@@ -293,7 +308,7 @@ def test_restart_with_a_modulus_changed_by_the_load(tmp_path):
         scene = block("quadrilateral", n=4)
         top = fem.Constant(scene.mesh, 0.0)
         contact = scene.contact(fc.Coulomb(0.3))
-        bcs = [scene.hold(TOP, 0), scene.hold(TOP, 1, top)]
+        bcs = [scene.dirichlet_bc(TOP, 0), scene.dirichlet_bc(TOP, 1, top)]
         problem = fc.ContactProblem(scene.F, scene.u, bcs=bcs, contacts=[contact])
 
         def load(t):
@@ -312,14 +327,14 @@ def test_restart_with_a_modulus_changed_by_the_load(tmp_path):
 def test_interrupted_loop_continues_with_other_steps(tmp_path):
     """The same call on the same problem, with other steps, continues the history (1e-7)."""
     path = shared_folder(tmp_path) / "state.npz"
-    made, whole = Press(), Press()
+    made, whole = BlockOnBallHistory(), BlockOnBallHistory()
     for step in made.increments(2.0, checkpoint=path):
         if step.increment == 2:
             break
     rest = made.increments(2.0, steps=[0.5, 1.0, 1.25, 1.5, 2.0], checkpoint=path)
     assert [s.load for s in rest] == [1.25, 1.5, 2.0]
     list(whole.increments(2.0, steps=[0.5, 1.0, 1.25, 1.5, 2.0]))
-    assert differences(made, whole, 1e-7) == []
+    assert find_differences(made, whole, 1e-7) == []
 
 
 @pytest.mark.each
@@ -335,8 +350,8 @@ def test_restart_restores_results_of_a_finished_history(obstacle, enforcement, t
     def make():
         given = {"contact": {"enforcement": enforcement}}
         if obstacle == "rigid":
-            return Press(**given)
-        return Ramp(update_pairs="increment" if "anew" in obstacle else "never", **given)
+            return BlockOnBallHistory(**given)
+        return BlockOnRamp(update_pairs="increment" if "anew" in obstacle else "never", **given)
 
     end = 1.9  # at 2 the slip distance reaches a facet, the limit without pair updates
     path = shared_folder(tmp_path) / "state.npz"
@@ -349,20 +364,20 @@ def test_restart_restores_results_of_a_finished_history(obstacle, enforcement, t
     assert last.slip > 0
     tolerance = 0.0 if COMM.size == 1 else 1e-12
     (first,) = one.problem.contacts
-    slid = at_points(first, first.slip_increment)
+    slid = point_values(first, first.slip_increment)
     for made in (one, called, loaded):
         (contact,) = made.problem.contacts
         found = contact.resultants()
         assert (found.open, found.stick, found.slip) == (last.open, last.stick, last.slip)
         for name in ("force", "normal_force", "tangential_force", "area", "max_pressure"):
-            assert close(getattr(found, name), getattr(last, name), tolerance), name
-        assert close(at_points(contact, contact.slip_increment), slid, tolerance)
+            assert is_close(getattr(found, name), getattr(last, name), tolerance), name
+        assert is_close(point_values(contact, contact.slip_increment), slid, tolerance)
 
 
 def test_restart_with_ranks_without_nodes(tmp_path):
     """A body of one cell, so that only one rank has nodes, agrees after the restart (1e-7)."""
     folder = shared_folder(tmp_path)
-    whole, stopped, after = (Rub(mesh={"n": 1}) for _ in range(3))
+    whole, stopped, after = (BlockOnBall(mesh={"n": 1}) for _ in range(3))
     for _ in fc.increments(whole.problem, whole.load, 0.0, 2.0, steps=4):
         pass
     options = {"steps": 4, "checkpoint": folder / "one.npz"}
@@ -371,5 +386,5 @@ def test_restart_with_ranks_without_nodes(tmp_path):
             break
     rest = list(fc.increments(after.problem, after.load, 0.0, 2.0, **options))
     assert [step.increment for step in rest] == [3, 4]
-    assert close(owned(after.scene.u), owned(whole.scene.u), 1e-7)
-    assert close(after.contact.resultants().force, whole.contact.resultants().force, 1e-7)
+    assert is_close(owned_values(after.scene.u), owned_values(whole.scene.u), 1e-7)
+    assert is_close(after.contact.resultants().force, whole.contact.resultants().force, 1e-7)

@@ -13,16 +13,22 @@ from mpi4py import MPI
 
 from fenics_contact import compat
 from fenics_contact.histories.point_matching import locate_nodes, nodal_values
-from scenes.comparing import close, gathered, owned, raised_everywhere, shared_folder
+from scenes.comparison import (
+    assert_raised_on_all_ranks,
+    gather,
+    is_close,
+    owned_values,
+    shared_folder,
+)
 from scenes.elasticity import strain
-from scenes.histories import Press, differences
+from scenes.histories import BlockOnBallHistory, find_differences
 
 COMM = MPI.COMM_WORLD
 
 pytestmark = pytest.mark.mpi
 
 
-def more_fields(made: Press) -> list[fem.Function]:
+def more_fields(made: BlockOnBallHistory) -> list[fem.Function]:
     """Return functions of all kinds that can be saved."""
     mesh, submesh = made.scene.mesh, made.problem.contacts[0].surface.submesh
     cell = mesh.basix_cell()
@@ -63,7 +69,7 @@ def fill(fields: list[fem.Function], k: float) -> None:
 def test_fields_of_every_kind_are_saved_and_restored(cell, tmp_path):
     """Fields are saved after an increment's loop body and set at restart, with ghosts, to 1e-12."""
     path = shared_folder(tmp_path) / "state.npz"
-    made, after = Press(cell=cell, n=2), Press(cell=cell, n=2)
+    made, after = BlockOnBallHistory(cell=cell, n=2), BlockOnBallHistory(cell=cell, n=2)
     fields = more_fields(made)
     for step in made.increments(checkpoint=path, state_fields=fields):
         fill(fields, step.increment)
@@ -76,14 +82,14 @@ def test_fields_of_every_kind_are_saved_and_restored(cell, tmp_path):
     assert next(steps).increment == 3
     for field, reference in zip(fields, expected, strict=True):
         found, wanted = field.x.array, reference.x.array
-        assert close(gathered(COMM, found), gathered(COMM, wanted), 1e-12), field.name
-    other = Press(cell=cell, n=2)
+        assert is_close(gather(COMM, found), gather(COMM, wanted), 1e-12), field.name
+    other = BlockOnBallHistory(cell=cell, n=2)
     fields = more_fields(other)
     for wrong in (fields[:-1], [], fields[::-1], [*fields, other.plastic]):
         call = lambda wrong=wrong: next(  # noqa: E731
             other.increments(checkpoint=path, state_fields=wrong, on_mismatch="continue")
         )
-        raised_everywhere(call, ValueError, str(path))
+        assert_raised_on_all_ranks(call, ValueError, str(path))
 
 
 @pytest.mark.parametrize("bulk", ["linear with plastic", "nonlinear"])
@@ -103,23 +109,25 @@ def test_restart_with_plastic_strains(bulk, tmp_path):
             if step.increment == stop:
                 break
 
-    whole, broken, after = (Press(bulk=bulk, n=4) for _ in range(3))
+    whole, broken, after = (BlockOnBallHistory(bulk=bulk, n=4) for _ in range(3))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*assumed small")
         run(whole, folder / "whole.npz")
         run(broken, folder / "part.npz", stop=3)
         run(after, folder / "part.npz")
-    assert np.abs(gathered(COMM, owned(whole.plastic))).max() > 1e-4
+    assert np.abs(gather(COMM, owned_values(whole.plastic))).max() > 1e-4
     tolerance = 0.0 if COMM.size == 1 else 1e-7
-    assert differences(after, whole, tolerance) == []
-    assert close(gathered(COMM, owned(after.plastic)), gathered(COMM, owned(whole.plastic)), 1e-7)
+    assert find_differences(after, whole, tolerance) == []
+    assert is_close(
+        gather(COMM, owned_values(after.plastic)), gather(COMM, owned_values(whole.plastic)), 1e-7
+    )
 
 
 def test_fields_missing_in_a_checkpoint_are_reported(tmp_path, caplog):
     """A field changed by the loop but not saved causes one warning, and a restart is refused."""
     path = shared_folder(tmp_path) / "state.npz"
-    made = Press(bulk="nonlinear")
+    made = BlockOnBallHistory(bulk="nonlinear")
     with pytest.warns(UserWarning, match="plastic in the bulk form") as warned:
         for step in made.increments(checkpoint=path):
             made.plastic.x.array[:] = -1e-3 * step.increment
@@ -127,14 +135,14 @@ def test_fields_missing_in_a_checkpoint_are_reported(tmp_path, caplog):
                 break
     assert len([w for w in warned if "plastic" in str(w.message)]) == 1
     assert caplog.text.count("plastic in the bulk form") == (COMM.rank == 0)
-    after = Press(bulk="nonlinear")
-    raised_everywhere(lambda: next(after.increments(checkpoint=path)), ValueError, "bulk")
+    after = BlockOnBallHistory(bulk="nonlinear")
+    assert_raised_on_all_ranks(lambda: next(after.increments(checkpoint=path)), ValueError, "bulk")
 
 
 def test_fields_that_cannot_be_saved_are_refused(tmp_path):
     """Fields that cannot be saved are named in an error when the history is set up."""
     path = shared_folder(tmp_path) / "state.npz"
-    made = Press()
+    made = BlockOnBallHistory()
     mesh = made.scene.mesh
     edges = fem.Function(fem.functionspace(mesh, ("RTCE", 1)), name="edges")
     bubbles = basix.ufl.element("bubble", mesh.basix_cell(), 3)  # four functions a cell
@@ -152,7 +160,7 @@ def test_fields_that_cannot_be_saved_are_refused(tmp_path):
         (made.scene.E, "Constant"),
     ):
         call = lambda field=field: made.increments(checkpoint=path, state_fields=[field])  # noqa: E731
-        raised_everywhere(call, ValueError, word)
-    raised_everywhere(
+        assert_raised_on_all_ranks(call, ValueError, word)
+    assert_raised_on_all_ranks(
         lambda: made.increments(state_fields=[made.plastic]), ValueError, "checkpoint"
     )

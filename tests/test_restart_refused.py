@@ -15,9 +15,9 @@ import fenics_contact as fc
 from fenics_contact import checkpoint
 from fenics_contact.histories import checkpoint_file
 from scenes.bodies import boxes
-from scenes.comparing import owned, raised_everywhere, shared_folder
-from scenes.elasticity import displacement_space, hold, residual
-from scenes.histories import Press, differences
+from scenes.comparison import assert_raised_on_all_ranks, owned_values, shared_folder
+from scenes.elasticity import dirichlet_bc, displacement_space, residual
+from scenes.histories import BlockOnBallHistory, find_differences
 
 COMM = MPI.COMM_WORLD
 
@@ -28,10 +28,10 @@ pytestmark = pytest.mark.mpi
 
 
 @pytest.fixture
-def saved(tmp_path):
+def saved_checkpoint(tmp_path):
     """Return the path of a checkpoint of a history stopped after increment 3."""
     path = shared_folder(tmp_path) / "state.npz"
-    made = Press(wall=True)
+    made = BlockOnBallHistory(wall=True)
     for step in made.increments(checkpoint=path):
         if step.increment == 3:
             break
@@ -65,42 +65,44 @@ OTHER = {
 
 @pytest.mark.whole
 @pytest.mark.parametrize("other", OTHER)
-def test_changed_data_are_refused(other, saved):
+def test_changed_data_are_refused(other, saved_checkpoint):
     """The error names the change, with both values of a number, and the problem is unchanged.
 
     With ``on_mismatch="continue"`` the history continues.
     """
     options, words = OTHER[other]
     options = {n: v() if callable(v) else v for n, v in options.items()}
-    made, fresh = Press(wall=True, **options), Press(wall=True, **options)
-    before = saved.read_bytes()
-    call = lambda: next(made.increments(checkpoint=saved))  # noqa: E731
-    raised_everywhere(call, ValueError, str(saved), *words, "remove it", "continue")
-    assert made.problem.increment == 0 and saved.read_bytes() == before
+    made, fresh = BlockOnBallHistory(wall=True, **options), BlockOnBallHistory(wall=True, **options)
+    before = saved_checkpoint.read_bytes()
+    call = lambda: next(made.increments(checkpoint=saved_checkpoint))  # noqa: E731
+    assert_raised_on_all_ranks(
+        call, ValueError, str(saved_checkpoint), *words, "remove it", "continue"
+    )
+    assert made.problem.increment == 0 and saved_checkpoint.read_bytes() == before
     assert [c.value.max() for c in made.push] == [0.0, 0.0]
     # The problem is as if there had been no file.
     for each in (made, fresh):
         each.load(0.5)
         each.problem.solve()
         each.problem.commit()
-    assert differences(made, fresh, 0.0 if COMM.size == 1 else 1e-7) == []
-    told = Press(wall=True, **options)
-    step = next(told.increments(checkpoint=saved, on_mismatch="continue"))
+    assert find_differences(made, fresh, 0.0 if COMM.size == 1 else 1e-7) == []
+    told = BlockOnBallHistory(wall=True, **options)
+    step = next(told.increments(checkpoint=saved_checkpoint, on_mismatch="continue"))
     assert step.increment == 4 and step.load == 2.0
 
 
-def test_other_loads_and_conditions_are_refused(saved):
+def test_other_loads_and_conditions_are_refused(saved_checkpoint):
     """An additional load, and another value or component of a condition, are refused."""
-    made = Press(wall=True)
+    made = BlockOnBallHistory(wall=True)
     made.scene.load(side=1.0)
-    call = lambda: next(made.increments(checkpoint=saved))  # noqa: E731
-    raised_everywhere(call, ValueError, "loads of the bulk", "v·f")
-    made = Press(wall=True)
+    call = lambda: next(made.increments(checkpoint=saved_checkpoint))  # noqa: E731
+    assert_raised_on_all_ranks(call, ValueError, "loads of the bulk", "v·f")
+    made = BlockOnBallHistory(wall=True)
     load = made.load
     made.load = lambda t: load(1.01 * t)
-    raised_everywhere(call, ValueError, "a value prescribed by a Dirichlet condition")
-    made = Press(wall=True, held=[1])
-    raised_everywhere(call, ValueError, "Dirichlet conditions", "components of nodes")
+    assert_raised_on_all_ranks(call, ValueError, "a value prescribed by a Dirichlet condition")
+    made = BlockOnBallHistory(wall=True, prescribed_components=[1])
+    assert_raised_on_all_ranks(call, ValueError, "Dirichlet conditions", "components of nodes")
 
 
 FIXED = {
@@ -119,33 +121,33 @@ FIXED = {
 
 @pytest.mark.whole
 @pytest.mark.parametrize("other", FIXED)
-def test_incompatible_checkpoints_are_always_refused(other, saved):
+def test_incompatible_checkpoints_are_always_refused(other, saved_checkpoint):
     """States of other meshes, elements, points or history fields cannot be transferred."""
     options, words = FIXED[other]
     options = {n: v() if callable(v) else v for n, v in options.items()}
     for changed in ("refuse", "continue"):
-        made = Press(**({"wall": True} | options))
+        made = BlockOnBallHistory(**({"wall": True} | options))
         call = lambda made=made, changed=changed: next(  # noqa: E731
-            made.increments(checkpoint=saved, on_mismatch=changed)
+            made.increments(checkpoint=saved_checkpoint, on_mismatch=changed)
         )
-        raised_everywhere(call, ValueError, *words)
+        assert_raised_on_all_ranks(call, ValueError, *words)
         assert made.problem.increment == 0
 
 
-def test_mesh_with_displaced_nodes_is_refused(saved):
+def test_mesh_with_displaced_nodes_is_refused(saved_checkpoint):
     """The number of nodes is the same, but some are displaced by 1e-6 of the body's size."""
-    made = Press(wall=True)
+    made = BlockOnBallHistory(wall=True)
     x = made.scene.mesh.geometry.x
     x[np.all(np.abs(x[:, :2] - 0.5) < 1e-9, axis=1), 0] += 1e-6
-    call = lambda: next(made.increments(checkpoint=saved, on_mismatch="continue"))  # noqa: E731
-    raised_everywhere(call, ValueError, "nodes", "locations")
+    call = lambda: next(made.increments(checkpoint=saved_checkpoint, on_mismatch="continue"))  # noqa: E731
+    assert_raised_on_all_ranks(call, ValueError, "nodes", "locations")
 
 
 def test_data_changed_by_the_load_are_accepted(tmp_path):
     """A friction coefficient and an obstacle set by the load are compared at the stored load."""
     path = shared_folder(tmp_path) / "state.npz"
 
-    class Both(Press):
+    class Both(BlockOnBallHistory):
         def load(self, t):
             super().load(t)
             self.problem.contacts[0].parameters["friction"].value = 0.1 + 0.1 * t
@@ -158,10 +160,10 @@ def test_data_changed_by_the_load_are_accepted(tmp_path):
 def test_nonlinear_bulk_is_compared_at_the_stored_state(tmp_path):
     """Two bodies whose stiffness differs only when they are deformed are distinguished."""
     path = shared_folder(tmp_path) / "state.npz"
-    made = Press(bulk="nonlinear")
+    made = BlockOnBallHistory(bulk="nonlinear")
     next(made.increments(checkpoint=path))
-    other = Press(bulk="less stiffening")
-    raised_everywhere(
+    other = BlockOnBallHistory(bulk="less stiffening")
+    assert_raised_on_all_ranks(
         lambda: next(other.increments(checkpoint=path)), ValueError, "stiffness of the bulk"
     )
 
@@ -170,20 +172,22 @@ def test_uncommitted_state_is_not_saved(tmp_path):
     """Before `commit` or `restore` nothing is written; after it, the committed state is saved."""
     path = shared_folder(tmp_path) / "state.npz"
     for end in ("commit", "restore"):
-        made = Press()
+        made = BlockOnBallHistory()
         next(made.increments())
         made.load(1.0)
         made.problem.solve(recover_interior=False)
-        raised_everywhere(lambda m=made: checkpoint.save(m.problem, path), ValueError, "commit()")
+        assert_raised_on_all_ranks(
+            lambda m=made: checkpoint.save(m.problem, path), ValueError, "commit()"
+        )
         assert not checkpoint.exists(made.problem, path)
         getattr(made.problem, end)()
         checkpoint.save(made.problem, path)
         COMM.barrier()
-        after = Press()
+        after = BlockOnBallHistory()
         after.load(1.0)
         call = lambda after=after: checkpoint.load(after.problem, path)  # noqa: E731
         if end == "restore":
-            raised_everywhere(call, ValueError, "Dirichlet")
+            assert_raised_on_all_ranks(call, ValueError, "Dirichlet")
             after.load(0.5)
         assert call() == []
         assert after.problem.increment == (2 if end == "commit" else 1)
@@ -196,7 +200,7 @@ def test_uncommitted_state_is_not_saved(tmp_path):
 # ---- position in the load path -------------------------------------------------------------------
 
 
-def test_other_load_paths_are_refused(saved):
+def test_other_load_paths_are_refused(saved_checkpoint):
     """The error states both load paths; the requested one must contain the stored loads."""
     for arguments in (
         {"end": 0.5, "steps": 1},  # ends before the stored load
@@ -205,25 +209,29 @@ def test_other_load_paths_are_refused(saved):
         {"start": 0.25, "steps": 8},
         {"end": 5.0, "steps": 8},
     ):
-        made = Press(wall=True)
-        call = lambda made=made, a=arguments: next(made.increments(checkpoint=saved, **a))  # noqa: E731
-        text = raised_everywhere(call, ValueError, "another load path", "from 0 to 4 by 8", "1.5")
+        made = BlockOnBallHistory(wall=True)
+        call = lambda made=made, a=arguments: next(  # noqa: E731
+            made.increments(checkpoint=saved_checkpoint, **a)
+        )
+        text = assert_raised_on_all_ranks(
+            call, ValueError, "another load path", "from 0 to 4 by 8", "1.5"
+        )
         assert f"to {arguments.get('end', 4.0):g} by" in text
         assert made.problem.increment == 0
-    made = Press(wall=True)
+    made = BlockOnBallHistory(wall=True)
     made.increments(estimate=True)
-    call = lambda: next(made.increments(checkpoint=saved, estimate=True))  # noqa: E731
-    raised_everywhere(call, ValueError, "estimate")
+    call = lambda: next(made.increments(checkpoint=saved_checkpoint, estimate=True))  # noqa: E731
+    assert_raised_on_all_ranks(call, ValueError, "estimate")
 
 
 # ---- damaged files -------------------------------------------------------------------------------
 
 
-def test_flipped_bits_and_truncated_files_are_detected(saved):
+def test_flipped_bits_and_truncated_files_are_detected(saved_checkpoint):
     """Damage anywhere is refused; the problem is unchanged, and then reads the intact file."""
-    content = saved.read_bytes()
+    content = saved_checkpoint.read_bytes()
     COMM.barrier()
-    made, n = Press(wall=True), len(content)
+    made, n = BlockOnBallHistory(wall=True), len(content)
     rng = np.random.default_rng(1)
     places = [0, 3, 8, 26, n - 1, n - 64, n - 70, n - 120, *rng.integers(0, n, 30)]
     bad = [content[:i] for i in (0, 1, 100, n // 2, n - 1, n - 64, n - 200)]
@@ -231,12 +239,12 @@ def test_flipped_bits_and_truncated_files_are_detected(saved):
     for i in places:
         bad.append(content[:i] + bytes([content[i] ^ 1 << int(rng.integers(8))]) + content[i + 1 :])
     for damaged in bad:
-        write(saved, damaged)
-        call = lambda: next(made.increments(checkpoint=saved))  # noqa: E731
-        raised_everywhere(call, ValueError, str(saved), "remove it")
-    assert made.problem.increment == 0 and not np.any(owned(made.scene.u))
-    write(saved, content)
-    assert next(made.increments(checkpoint=saved)).increment == 4
+        write(saved_checkpoint, damaged)
+        call = lambda: next(made.increments(checkpoint=saved_checkpoint))  # noqa: E731
+        assert_raised_on_all_ranks(call, ValueError, str(saved_checkpoint), "remove it")
+    assert made.problem.increment == 0 and not np.any(owned_values(made.scene.u))
+    write(saved_checkpoint, content)
+    assert next(made.increments(checkpoint=saved_checkpoint)).increment == 4
 
 
 def write(path: Path, content: bytes) -> None:
@@ -250,27 +258,27 @@ def write(path: Path, content: bytes) -> None:
 def test_other_file_formats_are_refused(tmp_path):
     """Texts, arrays, other archives and checkpoints of another format are refused."""
     path = shared_folder(tmp_path) / "state.npz"
-    made = Press()
+    made = BlockOnBallHistory()
     call = lambda: next(made.increments(checkpoint=path))  # noqa: E731
     if COMM.rank == 0:
         path.write_text("not a checkpoint\n" * 100)
-    raised_everywhere(call, ValueError, "no checkpoint")
+    assert_raised_on_all_ranks(call, ValueError, "no checkpoint")
     if COMM.rank == 0:
         with open(path, "wb") as file:
             np.save(file, np.ones(100))
-    raised_everywhere(call, ValueError, "no checkpoint")
+    assert_raised_on_all_ranks(call, ValueError, "no checkpoint")
     if COMM.rank == 0:
         np.savez(path, numbers=np.ones(3), nodes=np.ones((100, 4)))
-    raised_everywhere(call, ValueError, "no checkpoint")
+    assert_raised_on_all_ranks(call, ValueError, "no checkpoint")
     if COMM.rank == 0:
         checkpoint_file.write_file(path, {"format": 99}, {})
-    raised_everywhere(call, ValueError, "format 99")
+    assert_raised_on_all_ranks(call, ValueError, "format 99")
     if COMM.rank == 0:
         checkpoint_file.write_file(path, {"anything": 1}, {"nodes": np.ones(3)})
-    raised_everywhere(call, ValueError, "no checkpoint")
+    assert_raised_on_all_ranks(call, ValueError, "no checkpoint")
 
 
-def spoilt(name):
+def make_corruption(name):
     """Return a function that corrupts an array, or None if the array is to be removed."""
 
     def nan(array):
@@ -293,31 +301,31 @@ def spoilt(name):
 @pytest.mark.each
 @pytest.mark.parametrize("how", ["nan", "complex", "single", "words", "scalar", "short", "none"])
 @pytest.mark.parametrize("what", ["nodes", "contact floor", "stiffness", "state", "numbers"])
-def test_corrupted_arrays_are_refused(what, how, saved):
+def test_corrupted_arrays_are_refused(what, how, saved_checkpoint):
     """A file with a valid checksum is refused if an array is missing, not finite or mistyped."""
     if COMM.rank == 0:
-        scene, arrays = checkpoint_file.read_file(saved)
-        change = spoilt(how)
+        scene, arrays = checkpoint_file.read_file(saved_checkpoint)
+        change = make_corruption(how)
         if change is None:
             del arrays[what]
         else:
             arrays[what] = np.asarray(change(arrays[what]))
-        checkpoint_file.write_file(saved, scene, arrays)
+        checkpoint_file.write_file(saved_checkpoint, scene, arrays)
     COMM.barrier()
-    made = Press(wall=True)
-    call = lambda: next(made.increments(checkpoint=saved))  # noqa: E731
+    made = BlockOnBallHistory(wall=True)
+    call = lambda: next(made.increments(checkpoint=saved_checkpoint))  # noqa: E731
     missing = ["it lacks numbers"] * ((what, how) == ("numbers", "none"))
-    raised_everywhere(call, ValueError, str(saved), *missing)
-    assert made.problem.increment == 0 and not np.any(owned(made.scene.u))
+    assert_raised_on_all_ranks(call, ValueError, str(saved_checkpoint), *missing)
+    assert made.problem.increment == 0 and not np.any(owned_values(made.scene.u))
     assert [float(c.value) for c in made.push] == [0.0, 0.0]
 
 
-def test_unreadable_files_and_missing_folders_are_refused(saved, monkeypatch):
+def test_unreadable_files_and_missing_folders_are_refused(saved_checkpoint, monkeypatch):
     """A folder or an unreadable file raises OSError; a missing folder is refused at the call."""
-    made, folder = Press(wall=True), saved.parent
+    made, folder = BlockOnBallHistory(wall=True), saved_checkpoint.parent
     call = lambda path: next(made.increments(checkpoint=path))  # noqa: E731
-    raised_everywhere(lambda: call(folder), OSError)
-    raised_everywhere(
+    assert_raised_on_all_ranks(lambda: call(folder), OSError)
+    assert_raised_on_all_ranks(
         lambda: made.increments(checkpoint=folder / "none" / "x.npz"), ValueError, "no folder"
     )
 
@@ -326,13 +334,13 @@ def test_unreadable_files_and_missing_folders_are_refused(saved, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "read_bytes", refuse)
-        raised_everywhere(lambda: call(saved), OSError, "Permission denied")
+        assert_raised_on_all_ranks(lambda: call(saved_checkpoint), OSError, "Permission denied")
     assert made.problem.increment == 0
 
 
-def test_failing_load_function_leaves_the_problem_unchanged(saved):
+def test_failing_load_function_leaves_the_problem_unchanged(saved_checkpoint):
     """The function that sets the loads raises at the stored load."""
-    made = Press(wall=True)
+    made = BlockOnBallHistory(wall=True)
     load = made.load
 
     def failing(t):
@@ -341,8 +349,10 @@ def test_failing_load_function_leaves_the_problem_unchanged(saved):
         load(t)
 
     made.load = failing
-    raised_everywhere(lambda: next(made.increments(checkpoint=saved)), ValueError, "no such load")
-    assert made.problem.increment == 0 and not np.any(owned(made.scene.u))
+    assert_raised_on_all_ranks(
+        lambda: next(made.increments(checkpoint=saved_checkpoint)), ValueError, "no such load"
+    )
+    assert made.problem.increment == 0 and not np.any(owned_values(made.scene.u))
 
 
 def test_coinciding_cells_cannot_be_saved(tmp_path):
@@ -354,12 +364,12 @@ def test_coinciding_cells_cannot_be_saved(tmp_path):
     floor = fc.HalfSpace(point=(0, 0), normal=(0, 1))
     contact = fc.Contact(u, fc.ContactSurface(mesh, tags, 1), floor, fc.Coulomb(0.3))
     form = residual(u, ufl.TestFunction(u.function_space), 1000.0, 0.3)
-    conditions = [hold(u, tags, 2, 0), hold(u, tags, 2, 1, top)]
+    conditions = [dirichlet_bc(u, tags, 2, 0), dirichlet_bc(u, tags, 2, 1, top)]
     problem = fc.ContactProblem(form, u, bcs=conditions, contacts=[contact])
     path = shared_folder(tmp_path) / "state.npz"
     call = lambda: fc.increments(problem, top, 0, 1, steps=2, checkpoint=path)  # noqa: E731
-    raised_everywhere(call, ValueError, "9 nodes", "cells that coincide")
-    raised_everywhere(lambda: checkpoint.save(problem, path), ValueError, "9 nodes")
+    assert_raised_on_all_ranks(call, ValueError, "9 nodes", "cells that coincide")
+    assert_raised_on_all_ranks(lambda: checkpoint.save(problem, path), ValueError, "9 nodes")
     problem.solve()
     assert contact.resultants().normal_force > 0.0 and not path.exists()
 
@@ -372,7 +382,7 @@ def test_increments_without_iteration_warn(caplog):
 
     It is logged, too: FFCx hides Python's warnings if no logging has been set up.
     """
-    made = Press()
+    made = BlockOnBallHistory()
     with pytest.warns(RuntimeWarning, match="iterate over"):
         made.increments()
     assert made.problem.increment == 0
@@ -405,7 +415,7 @@ def test_increments_without_iteration_warn(caplog):
 )
 def test_arguments_are_checked_at_the_call(arguments, words):
     """Arguments are checked by the call of `increments`, not by its first increment."""
-    made = Press()
+    made = BlockOnBallHistory()
     arguments = {"load": made.load, "start": 0.0, "end": 1.0} | arguments
     call = lambda: fc.increments(made.problem, **arguments)  # noqa: E731
-    raised_everywhere(call, ValueError, *words)
+    assert_raised_on_all_ranks(call, ValueError, *words)

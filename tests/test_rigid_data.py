@@ -11,7 +11,7 @@ from mpi4py import MPI
 from scipy.spatial import ConvexHull
 
 import fenics_contact as fc
-from scenes.comparing import close, raised_everywhere, shared_folder
+from scenes.comparison import assert_raised_on_all_ranks, is_close, shared_folder
 from scenes.rubber import rubber
 from scenes.surfaces import ball, box, circle, ring, write_stl
 
@@ -185,20 +185,20 @@ def test_normal_and_curvature_at_edges_and_corners():
     obstacle = fc.RigidSurface(points, facets)
     found = obstacle.sample(points)
     assert np.abs(found.distance).max() == 0.0
-    assert close(found.normal, -points / np.sqrt(3), 1e-12)
+    assert is_close(found.normal, -points / np.sqrt(3), 1e-12)
     middle = np.array([[1.0, 1.0, 0.2], [-1.0, 0.1, 1.0]])
     expected = -middle * [[1, 1, 0], [1, 0, 1]] / np.sqrt(2)
-    assert close(obstacle.sample(middle).normal, expected, 1e-12)
+    assert is_close(obstacle.sample(middle).normal, expected, 1e-12)
     for side in (1.0, -1.0):
         x = points * (1 + side * 1e-4)
         assert np.all(np.sign(obstacle.sample(x).distance) == side)
     off = obstacle.sample(np.array([[1.3, 1.4, 0.2], [2.0, 3.0, 3.0]]))
-    assert close(off.distance, [0.5, 3.0], 1e-12)
+    assert is_close(off.distance, [0.5, 3.0], 1e-12)
     # Around the edge, level sets are circles (radius 0.5); around the corner, spheres (radius 3).
     t = np.array([-0.8, 0.6, 0.0])
-    assert close(off.curvature[0], np.outer(t, t) / 0.5, 1e-12)
+    assert is_close(off.curvature[0], np.outer(t, t) / 0.5, 1e-12)
     n = np.array([1.0, 2.0, 2.0]) / 3
-    assert close(off.curvature[1], (np.eye(3) - np.outer(n, n)) / 3, 1e-12)
+    assert is_close(off.curvature[1], (np.eye(3) - np.outer(n, n)) / 3, 1e-12)
 
 
 def test_points_beyond_the_border_of_an_open_surface_are_outside():
@@ -208,9 +208,9 @@ def test_points_beyond_the_border_of_an_open_surface_are_outside():
     assert not floor.facets.closed
     for obstacle in (floor, fc.RigidProfile([[1.0, 0.0], [0.3, 0.0], [-1.0, 0.0]])):
         found = obstacle.sample(x)
-        assert close(found.distance, [0.3, -0.3, 0.5, 0.5, 0.5], 1e-9)
-        assert close(found.normal[:2], [[0, -1], [0, -1]], 1e-9)
-        assert close(found.normal[3], np.array([-0.6, 0.8]), 1e-9)
+        assert is_close(found.distance, [0.3, -0.3, 0.5, 0.5, 0.5], 1e-9)
+        assert is_close(found.normal[:2], [[0, -1], [0, -1]], 1e-9)
+        assert is_close(found.normal[3], np.array([-0.6, 0.8]), 1e-9)
 
 
 def test_distance_of_a_faceted_ball_converges():
@@ -253,12 +253,12 @@ def test_halvings_approach_a_smooth_surface():
     wrong = [np.abs(s.sample(axis + 0.4 * out).distance).max() for s in (flat, bent)]
     assert wrong[0] > 1e-3 and wrong[1] < wrong[0] / 5
     assert bent.facets.closed
-    assert close(bent.sample(above).distance, np.ones(200), 1e-12)
+    assert is_close(bent.sample(above).distance, np.ones(200), 1e-12)
 
     points, facets = box((-1, -1, -1), (1, 1, 1))
     z = places(points, 100)
     whole, parts = (fc.RigidSurface(points, facets, halvings=n).sample(z) for n in (0, 2))
-    assert close(parts.distance, whole.distance, 1e-12)
+    assert is_close(parts.distance, whole.distance, 1e-12)
 
 
 def test_distant_points_and_no_points():
@@ -267,7 +267,7 @@ def test_distant_points_and_no_points():
     x /= np.linalg.norm(x, axis=1)[:, None]
     surface = fc.RigidSurface(*ball(5))
     for away in (1e3, 1e8, 1e60):
-        assert close(surface.sample(away * x).distance, away - np.ones(2000), 1e-6)
+        assert is_close(surface.sample(away * x).distance, away - np.ones(2000), 1e-6)
     # A point at the origin causes no division by zero.
     with np.errstate(all="raise"):
         assert fc.RigidSurface(*ball(1, 1e3)).sample(np.zeros((1, 3))).distance < 0
@@ -308,10 +308,10 @@ def test_spline_through_points_of_a_circle():
         length = np.linalg.norm(arm, axis=1)
         kept = length > 0.25
         found, n = obstacle.sample(place[kept]), arm[kept] / length[kept, None]
-        assert close(found.distance, length[kept] - radius, 1e-8, scale=1.0)
-        assert close(found.normal, -n, 1e-5)
+        assert is_close(found.distance, length[kept] - radius, 1e-8, scale=1.0)
+        assert is_close(found.normal, -n, 1e-5)
         bend = (matrix - np.einsum("ni,nj->nij", n, n)) / length[kept, None, None]
-        assert close(found.curvature, bend, 1e-3)
+        assert is_close(found.curvature, bend, 1e-3)
 
 
 # ---- files ---------------------------------------------------------------------------------------
@@ -331,12 +331,12 @@ def test_stl_files(binary, tmp_path):
     # A binary file has single precision: relative round-off 6e-8.
     allowed = 1e-6 if binary else 1e-12
     assert read.facets.closed and len(read.facets.facets) == len(facets)
-    assert close(read.sample(x).distance, given.distance, allowed)
+    assert is_close(read.sample(x).distance, given.distance, allowed)
     if COMM.rank == 0:
         (folder / "none.stl").write_text("solid nothing\nendsolid nothing\n")
     COMM.barrier()
     make = lambda: fc.RigidSurface.from_stl(folder / "none.stl")  # noqa: E731
-    raised_everywhere(make, ValueError, "holds no triangles")
+    assert_raised_on_all_ranks(make, ValueError, "holds no triangles")
 
 
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -379,7 +379,9 @@ def test_data_of_wrong_dimension_or_different_by_rank_are_refused():
     scene = rubber("tetrahedron", 1, n=(2, 1))
     law = fc.Frictionless(1e3)
     flat = fc.RigidProfile(circle(9), closed=True)
-    raised_everywhere(lambda: scene.contact(flat, law), ValueError, "2 dimensions")
+    assert_raised_on_all_ranks(lambda: scene.contact(flat, law), ValueError, "2 dimensions")
     own = fc.RigidSurface(*ball(1, 1.0 + COMM.rank))
     if COMM.size > 1:
-        raised_everywhere(lambda: scene.contact(own, law), ValueError, "differ between ranks")
+        assert_raised_on_all_ranks(
+            lambda: scene.contact(own, law), ValueError, "differ between ranks"
+        )

@@ -15,9 +15,9 @@ from mpi4py import MPI
 import fenics_contact as fc
 from benchmarks import random_scenes
 from fenics_contact.types import Array
-from scenes.beside import Beside, Box
 from scenes.blocks import BOTTOM, LEFT, TOP
-from scenes.comparing import close, raised_everywhere
+from scenes.comparison import assert_raised_on_all_ranks, is_close
+from scenes.unrelated_bodies import Box, SceneWithUnrelatedBodies
 from verification.fuzz_setup import run_history
 
 COMM = MPI.COMM_WORLD
@@ -36,12 +36,12 @@ def pressed(stiffness: float, carried: float, **options) -> tuple[Array, fc.Step
     The block, E = 1, is on a slab ``stiffness`` times as stiff; both are displaced by ``carried``.
     """
     slab = Box((-0.5, -0.5), (2.0, 0.5), (6, 2), stiffness)
-    scene = Beside({"slab": slab, "block": Box(n=(4, 4))})
+    scene = SceneWithUnrelatedBodies({"slab": slab, "block": Box(n=(4, 4))})
     along = scene.bodies.constant(carried)
-    scene.hold("slab", BOTTOM, 0, value=along)
-    scene.hold("slab", BOTTOM, 1)
-    scene.hold("block", TOP, 0, value=along)
-    scene.hold("block", TOP, 1, value=-1e-2)
+    scene.prescribe("slab", BOTTOM, 0, value=along)
+    scene.prescribe("slab", BOTTOM, 1)
+    scene.prescribe("block", TOP, 0, value=along)
+    scene.prescribe("block", TOP, 1, value=-1e-2)
     contact = scene.contact("block", BOTTOM, ("slab", TOP), fc.Coulomb(0.3), name="joint")
     step = scene.problem(contact, **options).solve()
     return step.contacts["joint"].force, step
@@ -63,7 +63,7 @@ def test_soft_block_on_a_displaced_stiff_slab(stiffness, carried, options):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         found, step = pressed(stiffness, carried, **options)
-    assert close(found, expected, 1e-8)
+    assert is_close(found, expected, 1e-8)
     inexact = step.verdict.inexact
     assert set(inexact) <= {"body 1"}
     said = [str(w.message) for w in caught if "round-off of its displacements" in str(w.message)]
@@ -82,12 +82,12 @@ def test_unconstrained_stiff_slab_between_blocks():
 
     def between(stiffness):
         slab = Box((-0.5, -0.2), (2.0, 0.2), (6, 2), stiffness)
-        scene = Beside({"low": Box((0.0, -1.2)), "slab": slab, "high": Box()})
+        scene = SceneWithUnrelatedBodies({"low": Box((0.0, -1.2)), "slab": slab, "high": Box()})
         along = scene.bodies.constant(0.3)
-        scene.hold("low", BOTTOM, 0, value=along)
-        scene.hold("low", BOTTOM, 1)
-        scene.hold("high", TOP, 0, value=along)
-        scene.hold("high", TOP, 1, value=-1e-2)
+        scene.prescribe("low", BOTTOM, 0, value=along)
+        scene.prescribe("low", BOTTOM, 1)
+        scene.prescribe("high", TOP, 0, value=along)
+        scene.prescribe("high", TOP, 1, value=-1e-2)
         joints = [
             scene.contact(box, side, ("slab", other), fc.Coulomb(0.3), name=box)
             for box, side, other in (("high", BOTTOM, TOP), ("low", TOP, BOTTOM))
@@ -96,8 +96,8 @@ def test_unconstrained_stiff_slab_between_blocks():
         return [step.contacts[joint.name].force for joint in joints]
 
     high, low = between(1.0)
-    assert close(high + low, 0 * high, 1e-8 * np.linalg.norm(high), scale=1.0)
-    raised_everywhere(lambda: between(1e12), fc.NotConverged, "with a round-off of")
+    assert is_close(high + low, 0 * high, 1e-8 * np.linalg.norm(high), scale=1.0)
+    assert_raised_on_all_ranks(lambda: between(1e12), fc.NotConverged, "with a round-off of")
 
 
 @pytest.mark.each
@@ -111,11 +111,11 @@ def test_round_off_of_a_load_counts_as_zero(kinematics, E):
     """
 
     def forces(loads):
-        scene = Beside({"block": Box()}, E=E)
+        scene = SceneWithUnrelatedBodies({"block": Box()}, E=E)
         load, along = scene.bodies.constant(0.0), scene.bodies.constant(0.0)
         scene.load("block", TOP, 1, load)
-        scene.hold("block", LEFT, 0, value=along)
-        scene.hold("block", LEFT, 1)
+        scene.prescribe("block", LEFT, 0, value=along)
+        scene.prescribe("block", LEFT, 1)
         floor = fc.HalfSpace((0, -1e-3), (0, 1))
         contact = scene.contact("block", BOTTOM, floor, fc.Coulomb(0.3), kinematics=kinematics)
         problem = scene.problem(contact, small_displacement_tolerance=np.inf)
@@ -166,10 +166,10 @@ def test_round_off_forces_supply_no_energy(kinematics, E):
     Friction of 1e-14 at one end of an increment, and zero at the other, was reported as energy
     supplied, 100 % of the energy exchanged. Reference: zero forces, to 1e-12 of E.
     """
-    scene = Beside({"block": Box(n=(4, 4))}, E=E)
+    scene = SceneWithUnrelatedBodies({"block": Box(n=(4, 4))}, E=E)
     place = [scene.bodies.constant(0.0) for _ in range(2)]
     for component, value in enumerate(place):
-        scene.hold("block", TOP, component, value=value)
+        scene.prescribe("block", TOP, component, value=value)
     floor = fc.HalfSpace((0, 0), (0, 1))
     contact = scene.contact("block", BOTTOM, floor, fc.Coulomb(0.3), kinematics=kinematics)
     problem = scene.problem(contact)
@@ -190,10 +190,10 @@ def test_a_load_is_removed_after_a_restart(options):
     1e-9 of the remaining forces and shrinks with them.
     """
     box = Box((0.0, 0.5), n=(4, 4), bend=lambda x: x + 0.05 * np.sin(7 * x[:, ::-1]))
-    scene = Beside({"block": box})
+    scene = SceneWithUnrelatedBodies({"block": box})
     top = scene.bodies.constant(0.0)
-    scene.hold("block", TOP, 0)
-    scene.hold("block", TOP, 1, value=top)
+    scene.prescribe("block", TOP, 0)
+    scene.prescribe("block", TOP, 1, value=top)
     problem = scene.problem(
         scene.contact("block", BOTTOM, fc.HalfSpace((0, 0), (0, 1)), fc.Frictionless()), **options
     )

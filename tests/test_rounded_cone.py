@@ -6,7 +6,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.blocks import TOP, block, dimension
-from scenes.comparing import close, gathered, raised_everywhere
+from scenes.comparison import assert_raised_on_all_ranks, gather, is_close
 
 COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
@@ -47,13 +47,13 @@ def test_gap_and_normal_are_those_of_the_generating_curve(cell):
     tip, axis = np.array([0.4] * (d - 1) + [-0.2]), np.array([0.3] * (d - 1) + [-1.0])
     obstacle = fc.RoundedCone(tip, axis, ANGLE, RADIUS)
     contact = scene.contact(fc.Frictionless(1e3), obstacle=obstacle)
-    x = gathered(COMM, contact.points)
-    gap, normal = (gathered(COMM, v) for v in (contact.gap, contact.values.normal))
-    assert close(gap, distance(x, tip, axis), 1e-7, scale=1.0)
-    assert close(np.linalg.norm(normal, axis=1), np.ones(len(x)), 1e-13)
+    x = gather(COMM, contact.points)
+    gap, normal = (gather(COMM, v) for v in (contact.gap, contact.values.normal))
+    assert is_close(gap, distance(x, tip, axis), 1e-7, scale=1.0)
+    assert is_close(np.linalg.norm(normal, axis=1), np.ones(len(x)), 1e-13)
     # A displacement of half the gap along the normal leaves half of the gap.
     halfway = x + gap[:, None] / 2 * normal
-    assert close(distance(halfway, tip, axis), gap / 2, 1e-6, scale=1.0)
+    assert is_close(distance(halfway, tip, axis), gap / 2, 1e-6, scale=1.0)
     assert np.ptp(np.arccos(np.clip(-normal @ axis / np.linalg.norm(axis), -1, 1))) > 0.3
 
 
@@ -62,7 +62,7 @@ def pressed(obstacle, cell, **options):
     # By default there are more points if the radius is smaller.
     scene = block(cell, n=4, surface={"quadrature_degree": 4})
     d = scene.dim
-    bcs = [scene.hold(TOP, i) for i in range(d)]
+    bcs = [scene.dirichlet_bc(TOP, i) for i in range(d)]
     problem, contact = scene.problem(
         fc.Coulomb(0.2), bcs, contact={"obstacle": obstacle, "kinematics": "finite"}, **options
     )
@@ -86,7 +86,7 @@ def test_contact_at_the_tip_has_the_forces_of_a_ball(cell):
     tip, radius = 0.45 * (1 - up), 8.0
     cone = pressed(fc.RoundedCone(tip, -up, np.deg2rad(70), radius), cell)
     ball = pressed(fc.Ball(tip - radius * up, radius), cell)
-    assert np.abs(ball).max() > 1.0 and close(cone, ball, 1e-7)
+    assert np.abs(ball).max() > 1.0 and is_close(cone, ball, 1e-7)
 
 
 def test_contact_at_the_flank_has_the_forces_of_a_half_space():
@@ -98,7 +98,7 @@ def test_contact_at_the_flank_has_the_forces_of_a_half_space():
     centre = np.array([1.0, 0.0]) - radius * n - 2.0 * np.array([-n[1], n[0]])
     wedge = pressed(fc.RoundedCone(centre - radius * axis, axis, angle, radius), "quadrilateral")
     plane = pressed(fc.HalfSpace((1.0, 0.0), n), "quadrilateral")
-    assert np.abs(plane).max() > 1.0 and close(wedge, plane, 1e-7)
+    assert np.abs(plane).max() > 1.0 and is_close(wedge, plane, 1e-7)
 
 
 def test_wedge_has_the_force_of_a_fine_profile():
@@ -114,7 +114,7 @@ def test_wedge_has_the_force_of_a_fine_profile():
         for obstacle in (fc.RoundedCone(tip, axis, angle, radius), fc.RigidProfile(profile))
     ]
     assert found[0][1] > 1.0 and abs(found[0][0]) < 1e-9 * found[0][1]
-    assert close(found[0], found[1], 1e-4)
+    assert is_close(found[0], found[1], 1e-4)
 
 
 def test_invalid_arguments_are_refused():
@@ -131,7 +131,7 @@ def test_invalid_arguments_are_refused():
         ("tip", (0.5, np.nan)),
     ):
         obstacle = fc.RoundedCone(**given | {name: value})
-        raised_everywhere(
+        assert_raised_on_all_ranks(
             lambda obstacle=obstacle: scene.contact(fc.Frictionless(), obstacle=obstacle),
             ValueError,
             name,

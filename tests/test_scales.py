@@ -14,7 +14,7 @@ from mpi4py import MPI
 import fenics_contact as fc
 from scenes.blocks import block
 from scenes.bodies import Bodies, boxes
-from scenes.comparing import at_points
+from scenes.comparison import point_values
 
 COMM = MPI.COMM_WORLD
 FLOOR, ROOF, FLOOR_2, ROOF_2 = 1, 2, 3, 4
@@ -31,7 +31,7 @@ def may_take_long(*, refused: bool) -> None:
 # ---- successive increments -----------------------------------------------------------------------
 
 
-def touched_again(level, small, *, accuracy=None, cell="triangle", **options):
+def repress(level, small, *, accuracy=None, cell="triangle", **options):
     """Press with ``level``, release, press with ``small``, shear by a fifth; return the forces.
 
     The material is such that the heavy load compresses it by 1 %. The body stays where it is
@@ -65,7 +65,7 @@ def test_small_load_after_a_large_one(level, accuracy):
     may_take_long(refused=level >= 1e7)
     small = 1e-4
     try:
-        (pressed, _, touched, sheared), rounded = touched_again(level, small, accuracy=accuracy)
+        (pressed, _, touched, sheared), rounded = repress(level, small, accuracy=accuracy)
     except fc.NotConverged:
         assert level >= 1e7
         return
@@ -79,7 +79,7 @@ def test_small_load_after_a_large_one(level, accuracy):
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("condensation", [None, False])
 def test_small_load_after_a_large_one_with_every_method(method, condensation):
-    (*_, sheared), _ = touched_again(1e3, 1e-4, method=method, condensation=condensation)
+    (*_, sheared), _ = repress(1e3, 1e-4, method=method, condensation=condensation)
     assert np.abs(sheared - [-0.2e-4, 1e-4]).max() <= 1e-8 * 1e-4
 
 
@@ -104,7 +104,7 @@ def test_load_reduced_in_one_increment(drop):
 # ---- bodies in one mesh --------------------------------------------------------------------------
 
 
-def beside(ratio, *, one_contact=False, joined=False, friction=0.5, **options):
+def press_two_boxes(ratio, *, one_contact=False, joined=False, friction=0.5, **options):
     """Press two boxes on a floor by 10 and 10/ratio, shear by a fifth; return loads, forces, step.
 
     ``one_contact``: one Γc of both. ``joined``: unused.
@@ -139,8 +139,8 @@ def beside(ratio, *, one_contact=False, joined=False, friction=0.5, **options):
     for low, high in ((-1, 1.5), (1.5, 4)):
         force = np.zeros(2)
         for contact in contacts:
-            rows = at_points(contact, np.hstack([contact.points, contact.traction]))
-            measure = at_points(contact, contact.measure[:, None])
+            rows = point_values(contact, np.hstack([contact.points, contact.traction]))
+            measure = point_values(contact, contact.measure[:, None])
             mine = (rows[:, 0] > low) & (rows[:, 0] < high)
             force += measure[mine, 0] @ rows[mine, 2:]
         found.append(force)
@@ -153,7 +153,7 @@ def beside(ratio, *, one_contact=False, joined=False, friction=0.5, **options):
 @pytest.mark.parametrize("ratio", [1e3, 1e4, 1e8])
 def test_lightly_loaded_body_next_to_a_heavily_loaded_one(ratio, method, one_contact):
     """The contact force on every body is its own load, to 1e-8 of this load."""
-    loads, found, step = beside(ratio, method=method, one_contact=one_contact)
+    loads, found, step = press_two_boxes(ratio, method=method, one_contact=one_contact)
     for load, force in zip(loads, found, strict=True):
         assert np.abs(force - [-0.2 * load, load]).max() <= 1e-8 * load
     assert set(step.verdict.equations) >= {"body 1", "body 2"}
@@ -163,7 +163,7 @@ def test_lightly_loaded_body_next_to_a_heavily_loaded_one(ratio, method, one_con
 
 def test_unbalanced_body_is_named():
     """A residual that is large relative to the body's own forces, not to others', fails."""
-    *_, step = beside(1e8)
+    *_, step = press_two_boxes(1e8)
     verdict = step.verdict
     light = verdict.equations["body 2"]  # bodies are numbered along x
     assert light.force < 1e-6
@@ -190,8 +190,8 @@ def test_tolerance_of_a_soft_body_next_to_a_stiff_one(condensation):
     made = boxes([[lines, lines], [lines + 2, lines]], sides)
     E = ufl.conditional(ufl.lt(ufl.SpatialCoordinate(made[0])[0], 1.5), 1e8, 1.0)
     body = Bodies(made, E, 0.3)
-    body.hold(ROOF, 0)
-    body.hold(ROOF, 1, value=-1e-3)
+    body.prescribe(ROOF, 0)
+    body.prescribe(ROOF, 1, value=-1e-3)
     floor = fc.HalfSpace((0, 0), (0, 1))
     contacts = [
         body.contact(tag, floor, fc.Coulomb(0.3), name=f"floor {tag}") for tag in (FLOOR, FLOOR_2)

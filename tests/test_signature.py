@@ -12,8 +12,8 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.histories.signature import signature_of_law, signature_of_obstacle
 from scenes.blocks import TOP, block
-from scenes.comparing import raised_everywhere, shared_folder
-from scenes.histories import Press
+from scenes.comparison import assert_raised_on_all_ranks, shared_folder
+from scenes.histories import BlockOnBallHistory
 
 COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.two_ranks, pytest.mark.newest]
@@ -103,16 +103,16 @@ def test_signature_of_a_deeply_nested_expression():
 def test_checkpoint_of_a_law_with_other_code_is_refused(other, tmp_path):
     """A law of the same name and parameters but other code is refused; the same code continues."""
     path, options = shared_folder(tmp_path) / "state.npz", {"friction": 0.3, "k_n": 2e4, "k_t": 1e4}
-    first = Press(made()(**options))
+    first = BlockOnBallHistory(made()(**options))
     for step in first.increments(checkpoint=path):
         if step.increment == 2:
             break
-    changed = Press(other(**options))
-    raised_everywhere(
+    changed = BlockOnBallHistory(other(**options))
+    assert_raised_on_all_ranks(
         lambda: next(changed.increments(checkpoint=path)), ValueError, "code (UFL) of the law of"
     )
-    assert next(Press(made()(**options)).increments(checkpoint=path)).increment == 3
-    told = Press(other(**options))
+    assert next(BlockOnBallHistory(made()(**options)).increments(checkpoint=path)).increment == 3
+    told = BlockOnBallHistory(other(**options))
     assert next(told.increments(checkpoint=path, on_mismatch="continue")).increment == 4
 
 
@@ -128,11 +128,13 @@ def test_checkpoint_of_an_obstacle_that_differs_off_contact_is_refused(tmp_path)
             return x[1] - height * ufl.max_value(x[0] - 2.0, 0.0) ** 2
 
         obstacle = fc.SignedDistance(distance)
-        bcs = [scene.hold(TOP, 1, push), scene.hold(TOP, 0)]
+        bcs = [scene.dirichlet_bc(TOP, 1, push), scene.dirichlet_bc(TOP, 0)]
         contact = {"obstacle": obstacle, "kinematics": "finite"}
         problem, _ = scene.problem(fc.Frictionless(), bcs, contact=contact)
         return fc.increments(problem, push, 0.0, -0.02, steps=2, checkpoint=path)
 
     next(history(0.0))
-    raised_everywhere(lambda: next(history(0.1)), ValueError, "code (UFL) of the obstacle of")
+    assert_raised_on_all_ranks(
+        lambda: next(history(0.1)), ValueError, "code (UFL) of the obstacle of"
+    )
     assert next(history(0.0)).increment == 2

@@ -5,8 +5,8 @@ import pytest
 from mpi4py import MPI
 
 import fenics_contact as fc
-from scenes.comparing import close, gathered, owned, raised_everywhere
-from scenes.two_blocks import LOWER, Slider, two_blocks
+from scenes.comparison import assert_raised_on_all_ranks, gather, is_close, owned_values
+from scenes.two_blocks import LOWER_FACE, SlidingBlock, two_blocks
 
 COMM = MPI.COMM_WORLD
 K_N = 1e7
@@ -23,23 +23,25 @@ def test_pairs_follow_a_displaced_body(cell, update):
     """
     n = (14, 4) if cell in ("triangle", "quadrilateral") else (7, 2)
     law = fc.Frictionless(k_n=K_N)
-    carried, standing = (Slider(cell, law, start=s, n=n, update_pairs=update) for s in (0.4, 1.73))
+    carried, standing = (
+        SlidingBlock(cell, law, start=s, n=n, update_pairs=update) for s in (0.4, 1.73)
+    )
     carried.step(-0.01, 1.33)  # lifted, without contact
     assert carried.contact.resultants().normal_force == 0.0
     carried.step(0.002, 1.33)
     standing.step(0.002, 0.0)
     assert standing.contact.resultants().normal_force > 0
     a, b = carried.contact.gather(), standing.contact.gather()
-    assert close(a["pressure"], b["pressure"], 1e-7)
+    assert is_close(a["pressure"], b["pressure"], 1e-7)
     # Without the update the pairs are those of the start: this is refused, or causes a warning.
-    held = Slider(cell, law, start=0.4, n=n, update_pairs="never")
+    held = SlidingBlock(cell, law, start=0.4, n=n, update_pairs="never")
     held.step(-0.01, 1.33)
     with pytest.raises(fc.NotConverged, match="small-displacement"):
         held.step(0.002, 1.33)
     held.problem.small_displacement_tolerance = np.inf
     with pytest.warns(UserWarning, match="assumed small"):
         held.step(0.002, 1.33)
-    assert not close(held.contact.gather()["pressure"], b["pressure"], 1e-3)
+    assert not is_close(held.contact.gather()["pressure"], b["pressure"], 1e-3)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -49,39 +51,39 @@ def test_steady_sliding_has_the_tangential_force_of_the_law(cell, method):
 
     Far from the ends of the base N changes only by its facets: 1 %.
     """
-    made = Slider(cell, fc.Coulomb(0.3, k_n=K_N, k_t=K_N), start=0.8, method=method)
+    made = SlidingBlock(cell, fc.Coulomb(0.3, k_n=K_N, k_t=K_N), start=0.8, method=method)
     made.step(0.002, 0.0)
     normal = []
     for along in np.linspace(0.1, 1.5, 15):
         step = made.step(0.002, along)
         r = step.contacts["contact"]
         assert r.stick == 0
-        assert close(r.tangential_force, 0.3 * r.normal_force, 1e-9)
+        assert is_close(r.tangential_force, 0.3 * r.normal_force, 1e-9)
         normal.append(r.normal_force)
         assert step.energy.dissipation > 0
     normal = np.array(normal[3:])
     assert np.abs(normal / normal.mean() - 1).max() < 0.01
     # In steady sliding slip equals the displacement: friction dissipates T times it per increment.
-    assert close(step.energy.dissipation, 0.3 * normal[-1] * 0.1, 0.01)
+    assert is_close(step.energy.dissipation, 0.3 * normal[-1] * 0.1, 0.01)
 
 
 def test_sticking_points_keep_their_traction_when_pairs_are_updated():
     """Sticking points keep their traction when their pairs are updated: there is no creep."""
-    made = Slider("quadrilateral", fc.Coulomb(5.0, k_n=K_N, k_t=K_N), start=1.1)
+    made = SlidingBlock("quadrilateral", fc.Coulomb(5.0, k_n=K_N, k_t=K_N), start=1.1)
     made.step(0.002, 0.0)
     made.step(0.002, 1e-4)
-    before = owned(made.u).copy()
+    before = owned_values(made.u).copy()
     shear = made.contact.resultants().force[0]
     for _ in range(3):
         made.step(0.002, 1e-4)
-    assert close(gathered(COMM, owned(made.u)), gathered(COMM, before), 1e-3)
-    assert close(made.contact.resultants().force[0], shear, 1e-2)
+    assert is_close(gather(COMM, owned_values(made.u)), gather(COMM, before), 1e-3)
+    assert is_close(made.contact.resultants().force[0], shear, 1e-2)
     assert made.contact.resultants().stick > 0
 
 
 def test_points_beyond_the_edge_are_open_and_counted():
     """Points displaced beyond the end of the base have no opposite point any more."""
-    made = Slider("quadrilateral", fc.Frictionless(k_n=K_N), start=2.7)
+    made = SlidingBlock("quadrilateral", fc.Frictionless(k_n=K_N), start=2.7)
     made.step(0.002, 0.0)
     assert made.contact.n_unpaired == 0
     for along in (0.3, 0.6):
@@ -99,9 +101,9 @@ def test_default_updates_pairs_after_slip_by_a_facet(condensation):
     different pairs in the first increments: the facets of both bodies are equal in size.
     """
     law = fc.Coulomb(0.3, k_n=K_N, k_t=K_N)
-    ways = [0.0, 0.2, 0.3, 0.4, 0.5]
+    slides = [0.0, 0.2, 0.3, 0.4, 0.5]
     made = {
-        update: Slider(
+        update: SlidingBlock(
             "quadrilateral",
             law,
             start=0.8,
@@ -116,14 +118,14 @@ def test_default_updates_pairs_after_slip_by_a_facet(condensation):
         slider.problem.small_displacement_tolerance = np.inf
         first = slider.contact.pairs.n_updates
         numbers[update], forces[update] = [], []
-        for way in ways:
-            step = slider.step(0.002, way)
+        for displacement in slides:
+            step = slider.step(0.002, displacement)
             numbers[update].append(slider.contact.pairs.n_updates - first)
             forces[update].append(step.contacts["contact"].force)
     assert numbers == {"never": [0] * 5, "auto": [0, 0, 1, 2, 3], "increment": [1, 2, 3, 4, 5]}
     never, auto, increment = (np.array(forces[update]) for update in made)
-    assert close(auto[:3], never[:3], 1e-12)
-    assert close(auto[3:], increment[3:], 1e-3)
+    assert is_close(auto[:3], never[:3], 1e-12)
+    assert is_close(auto[3:], increment[3:], 1e-3)
 
 
 def test_pair_update_recovers_the_interior_displacement():
@@ -131,22 +133,22 @@ def test_pair_update_recovers_the_interior_displacement():
     law = fc.Coulomb(0.3, k_n=K_N, k_t=K_N)
     forces = []
     for field in (True, False):
-        made = Slider("quadrilateral", law, start=0.8, update_pairs="auto", condensation=True)
+        made = SlidingBlock("quadrilateral", law, start=0.8, update_pairs="auto", condensation=True)
         steps = []
-        for way in [0.0, 0.2, 0.3, 0.4]:
-            made.move[-1].value, made.move[0].value = -0.002, way
+        for displacement in [0.0, 0.2, 0.3, 0.4]:
+            made.top_displacement[-1].value, made.top_displacement[0].value = -0.002, displacement
             steps.append(made.problem.solve(recover_interior=field))
             made.problem.commit()
         assert [step.complete for step in steps] == [True] * 4 if field else [False] * 3 + [True]
         assert made.contact.pairs.n_updates > 1
         forces.append([step.contacts["contact"].force for step in steps])
-    assert close(np.array(forces[1]), np.array(forces[0]), 1e-9)
+    assert is_close(np.array(forces[1]), np.array(forces[0]), 1e-9)
 
 
 def test_unknown_update_of_pairs_is_refused():
     """``update_pairs="step"`` is refused."""
     mesh, tags = two_blocks("triangle", (3, 4))
     assert mesh is not None
-    raised_everywhere(
-        lambda: fc.DeformableBody(tags, LOWER, update_pairs="step"), ValueError, "update_pairs"
+    assert_raised_on_all_ranks(
+        lambda: fc.DeformableBody(tags, LOWER_FACE, update_pairs="step"), ValueError, "update_pairs"
     )

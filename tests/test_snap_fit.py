@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import fenics_contact as fc
-from scenes.beside import Beside, Box
 from scenes.blocks import LEFT, RIGHT, TOP
+from scenes.unrelated_bodies import Box, SceneWithUnrelatedBodies
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 RADIUS, SLOPE, WAY = 2.0, 0.5, 0.5
@@ -19,12 +19,16 @@ def pushed(by, loads, *, friction):
     def rising(x):
         return np.column_stack([x[:, 0], x[:, 1] + SLOPE * x[:, 0]])
 
-    scene = Beside({"arm": Box(size=(5.0, 0.5), n=(60, 4), bend=rising)}, E=1e3, rubber=True)
-    scene.hold("arm", LEFT, 0)
-    scene.hold("arm", LEFT, 1)
+    scene = SceneWithUnrelatedBodies(
+        {"arm": Box(size=(5.0, 0.5), n=(60, 4), bend=rising)}, E=1e3, rubber=True
+    )
+    scene.prescribe("arm", LEFT, 0)
+    scene.prescribe("arm", LEFT, 1)
     load = scene.bodies.constant(0.0)
-    forces, ways = ((load, None), (None, 0.0)) if by == "force" else ((None, None), (load, 0.0))
-    motion = fc.Motion(force=forces, displacement=ways)
+    forces, displacements = (
+        ((load, None), (None, 0.0)) if by == "force" else ((None, None), (load, 0.0))
+    )
+    motion = fc.Motion(force=forces, displacement=displacements)
     normal = np.array([-SLOPE, 1.0]) / np.hypot(SLOPE, 1.0)
     centre = np.array([3.0, 0.5 + 3.0 * SLOPE]) + RADIUS * normal
     tool = fc.Cylinder(centre, RADIUS, displacement=motion)
@@ -49,30 +53,30 @@ def test_force_and_displacement_control_agree(friction):
     deformation due to a closed point, a thousandth of it: "no progress", however small the
     increments.
     """
-    ways = np.linspace(0.1, 1.0, 10) * WAY
-    forces, _, _ = pushed("displacement", ways, friction=friction)
+    displacements = np.linspace(0.1, 1.0, 10) * WAY
+    forces, _, _ = pushed("displacement", displacements, friction=friction)
     assert np.all(np.diff(forces) > 0)
     found, places, iterations = pushed("force", forces, friction=friction)
     assert np.abs(found - forces).max() <= 1e-8 * forces.max()
-    assert np.abs(places - ways).max() <= 1e-6 * WAY
+    assert np.abs(places - displacements).max() <= 1e-6 * WAY
     assert iterations.max() <= 40  # 5 to 13
 
 
-def step_of(gap, force, parked=(), *, along=None):
+def step_of(gap, force, other_gaps=(), *, along=None):
     """Return the first Newton displacement of a tool above an arm, by a force along y (length).
 
-    ``parked``: gap of a wall next to the arm, which the tool does not move. ``along``: a force
+    ``other_gaps``: gap of a wall next to the arm, which the tool does not move. ``along``: a force
     along x on the tool; by default its displacement along x is prescribed.
     """
-    scene = Beside({"arm": Box(size=(1.0, 1.0), n=(4, 4))}, E=1e3)
-    scene.hold("arm", LEFT, 0)
-    scene.hold("arm", LEFT, 1)
+    scene = SceneWithUnrelatedBodies({"arm": Box(size=(1.0, 1.0), n=(4, 4))}, E=1e3)
+    scene.prescribe("arm", LEFT, 0)
+    scene.prescribe("arm", LEFT, 1)
     held = 0.0 if along is None else None
     motion = fc.Motion(force=(along, force), displacement=(held, None))
     tool = fc.HalfSpace((0.0, 1.0 + gap), (0, -1), displacement=motion)
     contacts = [scene.contact("arm", TOP, tool, fc.Coulomb(3.0), name="tool")]
-    if parked:
-        wall = fc.HalfSpace((1.0 + parked[0], 0.0), (-1, 0))
+    if other_gaps:
+        wall = fc.HalfSpace((1.0 + other_gaps[0], 0.0), (-1, 0))
         contacts.append(scene.contact("arm", RIGHT, wall, fc.Frictionless(), name="parked"))
     problem = scene.problem(*contacts, condensation=False, method="newton")
     equations = problem.solver.equations
@@ -90,14 +94,14 @@ def step_of(gap, force, parked=(), *, along=None):
 
 
 @pytest.mark.parametrize("gap", [1e-2, 1e-6])
-@pytest.mark.parametrize("parked", [(), (1e-7,)], ids=["alone", "beside a nearer one"])
-def test_newton_step_is_twice_the_gap(gap, parked):
+@pytest.mark.parametrize("other_gaps", [(), (1e-7,)], ids=["alone", "beside a nearer one"])
+def test_newton_step_is_twice_the_gap(gap, other_gaps):
     """A tool above the arm, pressed down, moves by twice its gap, whatever other gaps there are.
 
     Tolerance 1e-3, as the arm deforms by force/E and a closed point carries the force, plus the gap
     by the size of the mesh, as any step is at most twice that size.
     """
-    moved = step_of(gap, -1e-7, parked)
+    moved = step_of(gap, -1e-7, other_gaps)
     assert moved == pytest.approx(-2 * gap, rel=1e-3 + gap)
 
 
@@ -107,10 +111,10 @@ def test_newton_step_with_a_larger_tangential_force():
     assert moved == pytest.approx(-2e-6, rel=1e-3)
 
 
-@pytest.mark.parametrize("parked", [(), (1e-7,)], ids=["alone", "beside a nearer one"])
-def test_newton_step_away_from_the_surface(parked):
+@pytest.mark.parametrize("other_gaps", [(), (1e-7,)], ids=["alone", "beside a nearer one"])
+def test_newton_step_away_from_the_surface(other_gaps):
     """A tool pushed away from an arm meets nothing, and moves by twice the mesh size, √2."""
-    assert step_of(1e-6, 1e-7, parked) == pytest.approx(2 * np.sqrt(2), rel=1e-3)
+    assert step_of(1e-6, 1e-7, other_gaps) == pytest.approx(2 * np.sqrt(2), rel=1e-3)
 
 
 def test_force_above_the_limit_of_the_arm():

@@ -15,19 +15,19 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from scenes.blocks import BOTTOM, GRID, LEFT, TOP, block, layers
-from scenes.comparing import (
-    at_points,
-    close,
-    compiled,
-    gathered,
-    identical,
-    nodal,
-    owned,
-    same_effort,
-    same_field,
+from scenes.block_on_ball import PATH, BlockOnBall, copy_state, solve_path
+from scenes.blocks import BOTTOM, GRID, LEFT, TOP, block, layer_partitioner
+from scenes.comparison import (
+    are_identical,
+    compile_with_maps,
+    gather,
+    have_similar_iterations,
+    is_close,
+    is_interpolant,
+    nodal_values,
+    owned_values,
+    point_values,
 )
-from scenes.rubbing import PATH, Rub, snapshot, walk
 from scenes.stacks import FLOOR, ROOF, joint, stack
 
 pytestmark = [
@@ -66,11 +66,11 @@ def test_patch(cell, degree):
 
     up = np.zeros((scene.dim, 1))
     up[-1] = p / k_n
-    assert same_field(scene.u, lambda x: exact(x) - up, 1e-10)
-    pressure = gathered(COMM, contact.pressure)
-    assert close(pressure, np.full(len(pressure), p), 1e-10)
+    assert is_interpolant(scene.u, lambda x: exact(x) - up, 1e-10)
+    pressure = gather(COMM, contact.pressure)
+    assert is_close(pressure, np.full(len(pressure), p), 1e-10)
     resultants = step.contacts["contact"]
-    assert close(resultants.force, -scene.vector(up=-p), 1e-10)
+    assert is_close(resultants.force, -scene.vector(up=-p), 1e-10)
     assert resultants.area == pytest.approx(1.0, rel=1e-12)
     assert resultants.open == resultants.stick == 0
     assert not step.verdict.failures
@@ -95,7 +95,7 @@ def test_block_far_above_its_floor_is_positioned(cell, condensation):
         step = problem.solve()
         assert step.iterations <= 25
         found.append(contact.resultants().tangential_force)
-    assert close(found[1], found[0], 1e-6) and close(found[2], found[0], 1e-6)
+    assert is_close(found[1], found[0], 1e-6) and is_close(found[2], found[0], 1e-6)
 
 
 @pytest.mark.parametrize("gaps", [(0.0, 0.05), (1e-4, 1e-5), (0.1, 0.05)])
@@ -107,7 +107,7 @@ def test_stack_of_unconstrained_blocks_is_positioned(gaps):
     """
     found = []
     for low, high in ((0.0, 0.0), gaps):
-        body = stack("triangle", (3, 4), (1.0, 1.0), apart=high)
+        body = stack("triangle", (3, 4), (1.0, 1.0), gap=high)
         body.F -= ufl.dot(body.constant((0.05, -1.0)), body.v) * body.ds(ROOF)
         law = fc.Coulomb(friction=0.3)
         under = body.contact(FLOOR, fc.HalfSpace((0.0, -low), (0.0, 1.0)), law, name="floor")
@@ -115,7 +115,7 @@ def test_stack_of_unconstrained_blocks_is_positioned(gaps):
         step = fc.ContactProblem(body.F, body.u, contacts=contacts).solve()
         assert step.iterations <= 10
         found.append([contact.resultants().tangential_force for contact in contacts])
-    assert close(found[1], found[0], 1e-6)
+    assert is_close(found[1], found[0], 1e-6)
 
 
 @pytest.mark.parametrize("tilt", [-0.1, 0.003])
@@ -131,7 +131,7 @@ def test_block_above_tilted_floor_is_positioned(tilt):
     problem, contact = scene.problem(fc.Coulomb(friction=0.2), [], contact={"obstacle": floor})
     step = problem.solve()
     assert step.iterations <= 100
-    assert close(contact.resultants().force, [-0.02, 1.0], 1e-8)
+    assert is_close(contact.resultants().force, [-0.02, 1.0], 1e-8)
 
 
 def test_block_is_positioned_in_corner_of_floor_and_wall():
@@ -156,7 +156,7 @@ def test_block_is_positioned_in_corner_of_floor_and_wall():
     step = fc.ContactProblem(scene.F, scene.u, contacts=contacts).solve()
     assert step.iterations <= 60
     forces = [contact.resultants().force for contact in contacts]
-    assert close(sum(forces), [0.6, 1.0], 1e-8)
+    assert is_close(sum(forces), [0.6, 1.0], 1e-8)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -166,12 +166,12 @@ def test_forces_balance_on_the_whole_path(method):
     Open, stick and slip points all occur. Reference: the bulk residual, summed over the dofs of
     the top. Tolerance 1e-7 of the force, as the solver's 1e-9 bounds the norm, not the sum.
     """
-    made = Rub(method=method)
+    made = BlockOnBall(method=method)
     space = made.scene.u.function_space
-    bulk = compiled(made.scene.F)
+    bulk = compile_with_maps(made.scene.F)
     seen = np.zeros(3, dtype=int)
     for side, down in PATH:
-        made.move(side, down)
+        made.set_top_displacement(side, down)
         step = made.problem.solve()
         r = step.contacts["contact"]
         reaction = fem.Function(space)
@@ -181,7 +181,7 @@ def test_forces_balance_on_the_whole_path(method):
         n_owned = space.dofmap.index_map.size_local
         values = reaction.x.array.reshape(-1, 2)[dofs[dofs < n_owned]]
         total = COMM.allreduce(values.sum(axis=0))
-        assert close(r.force, -total, 1e-7)
+        assert is_close(r.force, -total, 1e-7)
         assert r.tangential_force <= 0.3 * r.normal_force * (1 + 1e-10)
         seen += [r.open, r.stick, r.slip]
         made.problem.commit()
@@ -200,11 +200,11 @@ def test_failed_increment_leaves_no_trace(method):
     and another problem with the same u and contact solves the increment as one that never failed,
     to 1e-12: the computation is the same except for sums over ranks.
     """
-    made, twin = Rub(method=method), Rub(method=method)
+    made, twin = BlockOnBall(method=method), BlockOnBall(method=method)
     scene, contact = made.scene, made.contact
-    bcs = [scene.hold(TOP, i, c) for i, c in enumerate(made.push)]
+    bcs = [scene.dirichlet_bc(TOP, i, c) for i, c in enumerate(made.push)]
     for m in (made, twin):
-        walk(m, path=PATH[:2])
+        solve_path(m, path=PATH[:2])
     limited = fc.ContactProblem(
         scene.F,
         scene.u,
@@ -214,8 +214,8 @@ def test_failed_increment_leaves_no_trace(method):
         petsc_options={"snes_max_it": 1},
         prefix="limited_",
     )
-    before = snapshot(made)
-    made.move(*PATH[2])
+    before = copy_state(made)
+    made.set_top_displacement(*PATH[2])
     for _ in range(2):  # the second time with a solver that has failed
         with pytest.raises(fc.NotConverged) as caught:
             limited.solve()
@@ -225,40 +225,40 @@ def test_failed_increment_leaves_no_trace(method):
         assert error.iterations == 1
         assert "increment 1" in str(error) and "1 iterations" in str(error)
         assert error.verdict.failures
-        assert identical(snapshot(made), before)
+        assert are_identical(copy_state(made), before)
         assert limited.increment == 0
-    made.move(*PATH[1])
+    made.set_top_displacement(*PATH[1])
     assert limited.solve().iterations == 0
     scene.u.x.array[:] = before[0]
     for m in (made, twin):
-        walk(m, path=PATH[2:])
-    assert close(nodal(scene.u), nodal(twin.scene.u), 1e-12)
-    rows = (at_points(m.contact, m.contact.history.rows()) for m in (made, twin))
-    assert close(*rows, 1e-12)
+        solve_path(m, path=PATH[2:])
+    assert is_close(nodal_values(scene.u), nodal_values(twin.scene.u), 1e-12)
+    rows = (point_values(m.contact, m.contact.history.rows()) for m in (made, twin))
+    assert is_close(*rows, 1e-12)
 
 
 def test_increments_restores_the_load():
     """A failing `increments` restores load, u and history of the last committed increment."""
-    made = Rub(method="newton")
+    made = BlockOnBall(method="newton")
     steps = fc.increments(made.problem, made.push[1], 0.0, -0.03, steps=3)
     done = []
-    before = snapshot(made)
+    before = copy_state(made)
     with pytest.raises(fc.NotConverged):
         for step in steps:
             done.append(step.load)
-            before = snapshot(made)
+            before = copy_state(made)
             if len(done) == 2:
                 made.push[0].value = 0.02
                 made.problem.snes.setTolerances(max_it=1)
     assert done == pytest.approx([-0.01, -0.02], rel=1e-14)
     assert float(made.push[1].value) == done[-1]
-    assert identical(snapshot(made), before)
+    assert are_identical(copy_state(made), before)
     assert made.problem.increment == 2
 
 
 def test_increments_apply_the_load_in_equal_steps():
     """`increments` applies equal load steps, each solved and committed, numbered from 1."""
-    made = Rub(fc.Frictionless(k_n=2e4))
+    made = BlockOnBall(fc.Frictionless(k_n=2e4))
     steps = list(fc.increments(made.problem, made.push[1], 0.0, -0.02, steps=4))
     assert [s.load for s in steps] == pytest.approx([-0.005, -0.01, -0.015, -0.02], rel=1e-14)
     assert [s.increment for s in steps] == [1, 2, 3, 4]
@@ -273,7 +273,7 @@ def test_summary_without_forces(lift):
     scene = block("quadrilateral")
     problem, _ = scene.problem(
         fc.Coulomb(0.3, 1e4, 1e4),
-        [*scene.rollers(), scene.hold(TOP, scene.dim - 1, lift)],
+        [*scene.rollers(), scene.dirichlet_bc(TOP, scene.dim - 1, lift)],
         contact={"gap": 0.1},
     )
     step = problem.solve()
@@ -287,7 +287,7 @@ def test_summary_without_forces(lift):
 def test_reason_against_static_condensation_is_logged_once(caplog):
     """`increments` decides on static condensation again, but the reason is logged once."""
     with caplog.at_level("INFO", logger="fenics_contact"):
-        made = Rub(condensation=False)
+        made = BlockOnBall(condensation=False)
         list(fc.increments(made.problem, made.push[1], 0.0, -0.01, steps=2))
     said = [r.message for r in caplog.records if "no static condensation" in r.message]
     assert len(said) == (COMM.rank == 0)
@@ -296,7 +296,7 @@ def test_reason_against_static_condensation_is_logged_once(caplog):
 # ---- pairs and factorisations --------------------------------------------------------------------
 
 
-def recorded(made: Rub) -> list[float]:
+def recorded(made: BlockOnBall) -> list[float]:
     """Return a list to which SNES appends the residual norm of every iteration."""
     norms: list[float] = []
     made.problem.snes.setMonitor(lambda snes, it, norm: norms.append(norm))
@@ -310,31 +310,31 @@ def test_lbfgs_pairs_are_discarded_after_each_increment():
     would be the only difference. Residual norms of every iteration agree to 1e-9 of the first,
     round-off of sums over ranks that has grown over some iterations.
     """
-    made = Rub(fc.Frictionless(k_n=1e3), method="lbfgs")
+    made = BlockOnBall(fc.Frictionless(k_n=1e3), method="lbfgs")
     runs = []
     for number, (side, down) in enumerate([(0.0, 0.05), (0.01, 0.02), (0.0, 0.05)]):
         made.scene.u.x.array[:] = 0.0
-        made.move(side, down)
+        made.set_top_displacement(side, down)
         norms = recorded(made)
         step = made.problem.solve()
         made.problem.snes.cancelMonitor()
         assert step.factorisations == (number == 0)  # otherwise H₀ would differ too
-        runs.append((step.iterations, np.array(norms), gathered(COMM, owned(made.scene.u))))
+        runs.append((step.iterations, np.array(norms), gather(COMM, owned_values(made.scene.u))))
     first, _, again = runs
     assert first[0] == again[0] > 3
     assert first[1].shape == again[1].shape
     assert np.all(np.abs(again[1] - first[1]) <= 1e-9 * first[1][0])
-    assert close(again[2], first[2], 1e-12)
+    assert is_close(again[2], first[2], 1e-12)
 
 
 def test_factorisation_is_reused_until_the_modulus_changes():
     """Increments reuse the factorisation of H₀; a change of E requires another."""
-    made = Rub(fc.Frictionless(k_n=1e3))
-    made.move(0.0, 0.05)
+    made = BlockOnBall(fc.Frictionless(k_n=1e3))
+    made.set_top_displacement(0.0, 0.05)
     assert made.problem.solve().factorisations == 1
     made.problem.commit()
     for down in (0.055, 0.06, 0.065):
-        made.move(0.0, down)
+        made.set_top_displacement(0.0, down)
         assert made.problem.solve().factorisations == 0
         made.problem.commit()
     made.scene.E.value *= 2
@@ -355,7 +355,7 @@ def test_modulus_changed_between_increments():
         scene.E.value = E
         problem.solve()
         problem.commit()
-        assert same_field(
+        assert is_interpolant(
             scene.u, lambda x, E=E: np.vstack([0 * x[0], -2.0 / 5e3 - 2.0 / E * x[1]]), 1e-10
         )
 
@@ -365,15 +365,15 @@ def test_solving_twice_changes_nothing():
 
     Without a commit the history is the same, so that the state is already a solution.
     """
-    made = Rub()
-    walk(made, path=PATH[:2])
-    made.move(*PATH[2])
+    made = BlockOnBall()
+    solve_path(made, path=PATH[:2])
+    made.set_top_displacement(*PATH[2])
     made.problem.solve()
-    before = gathered(COMM, owned(made.scene.u))
+    before = gather(COMM, owned_values(made.scene.u))
     step = made.problem.solve()
     assert step.iterations == 0
     # Round-off of the conversion to dimensionless u and back.
-    assert close(gathered(COMM, owned(made.scene.u)), before, 1e-14)
+    assert is_close(gather(COMM, owned_values(made.scene.u)), before, 1e-14)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -382,14 +382,14 @@ def test_constant_load_takes_no_iterations_and_adds_no_slip(method):
 
     Tolerance 1e-12 of the accumulated slip, about 0.01: round-off.
     """
-    made = Rub(method=method)
+    made = BlockOnBall(method=method)
     for move in PATH:
-        walk(made, path=[move])
-        before = gathered(COMM, made.contact.slip)
+        solve_path(made, path=[move])
+        before = gather(COMM, made.contact.slip)
         step = made.problem.solve()
         made.problem.commit()
         assert step.iterations == 0
-        assert close(gathered(COMM, made.contact.slip), before, 1e-12, scale=0.01)
+        assert is_close(gather(COMM, made.contact.slip), before, 1e-12, scale=0.01)
 
 
 # ---- methods, units, ranks -----------------------------------------------------------------------
@@ -403,13 +403,13 @@ def test_methods_agree(cell, degree):
     """
     fields = []
     for method in ("lbfgs", "newton"):
-        made = Rub(cell=cell, degree=degree, method=method)
-        walk(made)
+        made = BlockOnBall(cell=cell, degree=degree, method=method)
+        solve_path(made)
         contact = made.contact
-        rows = (at_points(contact, x) for x in (contact.traction, contact.slip))
-        fields.append((nodal(made.scene.u), *rows))
+        rows = (point_values(contact, x) for x in (contact.traction, contact.slip))
+        fields.append((nodal_values(made.scene.u), *rows))
     for a, b in zip(*fields, strict=True):
-        assert close(a, b, 1e-7)
+        assert is_close(a, b, 1e-7)
     assert np.abs(fields[0][2]).max() > 1e-3
 
 
@@ -425,26 +425,26 @@ def test_solution_is_independent_of_units(method, law):
     path = PATH[:4] if law == "coulomb" else PATH[:1]
     results = []
     for length, pressure in [(1.0, 1.0), (1e-3, 1e6), (1e-9, 1.0), (1.0, 1e-9), (1e-9, 1e9)]:
-        made = Rub(make, length=length, pressure=pressure, method=method)
-        steps = walk(made, length, path)
+        made = BlockOnBall(make, length=length, pressure=pressure, method=method)
+        steps = solve_path(made, length, path)
         results.append(
             (
                 [s.iterations for s in steps],
-                nodal(made.scene.u) / length,
-                at_points(made.contact, made.contact.traction) / pressure,
+                nodal_values(made.scene.u) / length,
+                point_values(made.contact, made.contact.traction) / pressure,
             )
         )
     for iterations, u, traction in results[1:]:
-        assert same_effort(iterations, results[0][0])
-        assert close(u, results[0][1], 1e-9)
-        assert close(traction, results[0][2], 1e-9)
+        assert have_similar_iterations(iterations, results[0][0])
+        assert is_close(u, results[0][1], 1e-9)
+        assert is_close(traction, results[0][2], 1e-9)
 
 
 MESHES = {
     "triangle": {},
     "hexahedron": {"n": 2},
     # Γc on the first rank only.
-    "quadrilateral": {"n": (1, 6), "partitioner": layers("quadrilateral")},
+    "quadrilateral": {"n": (1, 6), "partitioner": layer_partitioner("quadrilateral")},
 }
 
 
@@ -456,12 +456,12 @@ def test_resultants_do_not_depend_on_the_number_of_ranks(cell):
     """
     resultants = []
     for comm in (COMM, MPI.COMM_SELF):
-        made = Rub(cell=cell, mesh=MESHES[cell] | {"comm": comm})
-        steps = walk(made, path=PATH[1:5])
+        made = BlockOnBall(cell=cell, mesh=MESHES[cell] | {"comm": comm})
+        steps = solve_path(made, path=PATH[1:5])
         resultants.append([s.contacts["contact"] for s in steps])
     for together, alone in zip(*resultants, strict=True):
         size = alone.normal_force
-        assert close(together.force, alone.force, 1e-8, scale=size)
+        assert is_close(together.force, alone.force, 1e-8, scale=size)
         assert abs(together.normal_force - alone.normal_force) <= 1e-8 * size
         assert abs(together.tangential_force - alone.tangential_force) <= 1e-8 * size
         assert together.max_pressure == pytest.approx(alone.max_pressure, rel=1e-7)
@@ -481,7 +481,7 @@ def test_ranks_without_cells(method):
         step = problem.solve()
         problem.commit()
         assert step.contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
-    assert np.all(gathered(COMM, contact.pressure) > 0)
+    assert np.all(gather(COMM, contact.pressure) > 0)
 
 
 @pytest.mark.parametrize("condensation", [False, None])
@@ -495,19 +495,19 @@ def test_methods_without_tangent_extrapolate_the_last_increment(method, condensa
     """
     scene = block("quadrilateral", n=4)
     led = fem.Constant(scene.mesh, 0.0)
-    bcs = [*scene.rollers(), scene.hold(TOP, 1, led)]
+    bcs = [*scene.rollers(), scene.dirichlet_bc(TOP, 1, led)]
     law = fc.Coulomb(10.0, 1e4, 1e4)
     problem, _ = scene.problem(law, bcs, method=method, condensation=condensation)
     found = []
     for step in fc.increments(problem, led, 0.0, -0.03, steps=[-0.01, -0.015, -0.03]):
         found.append((step.iterations, step.method))
         if len(found) == 1:
-            first = nodal(scene.u)
+            first = nodal_values(scene.u)
     for step in fc.increments(problem, led, -0.03, -0.004, steps=[-0.02, -0.004]):
         found.append((step.iterations, step.method))
     assert [n for n, _ in found[1:]] == [0, 0, 0, 0]
     assert {by for _, by in found} == {method}
-    assert close(nodal(scene.u), 0.4 * first, 1e-8)
+    assert is_close(nodal_values(scene.u), 0.4 * first, 1e-8)
 
 
 # ---- messages, restored state and memory ---------------------------------------------------------
@@ -516,15 +516,15 @@ def test_methods_without_tangent_extrapolate_the_last_increment(method, condensa
 def test_sound_solve_logs_no_warning(caplog):
     """A successful solve logs no warning."""
     with caplog.at_level(logging.WARNING, logger="fenics_contact"):
-        made = Rub(fc.Frictionless(k_n=2e4))
-        walk(made, path=PATH[:1])
+        made = BlockOnBall(fc.Frictionless(k_n=2e4))
+        solve_path(made, path=PATH[:1])
     assert not [r for r in caplog.records if r.name.startswith("fenics_contact")]
 
 
 def test_problem_is_freed_without_garbage_collector() -> None:
     """A problem has no reference cycles: all ranks free its factorisations at the same `del`."""
-    made = Rub()
-    made.move(*PATH[1])
+    made = BlockOnBall()
+    made.set_top_displacement(*PATH[1])
     made.problem.solve()
     gc.collect()
     gc.disable()
@@ -539,31 +539,31 @@ def test_problem_is_freed_without_garbage_collector() -> None:
 
 def test_restore_discards_the_uncommitted_increment() -> None:
     """`restore` resets u and history, after an uncommitted increment, to the last commit."""
-    made = Rub()
-    made.move(*PATH[1])
+    made = BlockOnBall()
+    made.set_top_displacement(*PATH[1])
     made.problem.solve()
     made.problem.commit()
-    before, u = snapshot(made), made.scene.u.x.array.copy()
-    made.move(*PATH[2])
+    before, u = copy_state(made), made.scene.u.x.array.copy()
+    made.set_top_displacement(*PATH[2])
     made.problem.solve()
     assert not np.array_equal(
-        gathered(COMM, owned(made.scene.u)), gathered(COMM, u[: len(owned(made.scene.u))])
+        gather(COMM, owned_values(made.scene.u)), gather(COMM, u[: len(owned_values(made.scene.u))])
     )
     made.problem.restore()
-    assert identical(snapshot(made), before)
+    assert are_identical(copy_state(made), before)
     assert np.array_equal(made.scene.u.x.array, u)
 
 
 @pytest.mark.parametrize("condensation", [None, False])
 def test_newton_after_increment_without_iterations(condensation):
     """An increment without load computes no tangent, and the next one starts without it."""
-    made = Rub(method="newton", condensation=condensation)
-    made.move(0.0, 0.0)
+    made = BlockOnBall(method="newton", condensation=condensation)
+    made.set_top_displacement(0.0, 0.0)
     made.scene.u.x.array[:] = 0.0
     first = made.problem.solve()
     made.problem.commit()
     assert first.iterations == 0
-    walk(made, path=PATH[:2])
+    solve_path(made, path=PATH[:2])
 
 
 @pytest.mark.parametrize("condensation", [None, False])
@@ -575,10 +575,10 @@ def test_newton_predictor_reduces_iterations_on_slip_path(condensation):
     """
     taken, states = [], []
     for helped in (True, False):
-        made = Rub(method="newton", condensation=condensation, mesh={"n": 12})
+        made = BlockOnBall(method="newton", condensation=condensation, mesh={"n": 12})
         taken.append(0)
         for i in range(1, 13):
-            made.move(0.004 * i, 0.05)
+            made.set_top_displacement(0.004 * i, 0.05)
             if not helped:
                 made.problem.restart_solver()
                 state = made.problem.state
@@ -586,6 +586,6 @@ def test_newton_predictor_reduces_iterations_on_slip_path(condensation):
             taken[-1] += made.problem.solve().iterations
             made.problem.commit()
         assert made.contact.resultants().slip > 0
-        states.append(owned(made.scene.u).copy())
+        states.append(owned_values(made.scene.u).copy())
     assert taken[0] < 0.8 * taken[1]
-    assert close(*states, 1e-7)
+    assert is_close(*states, 1e-7)

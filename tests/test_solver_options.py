@@ -10,9 +10,15 @@ from petsc4py import PETSc
 import fenics_contact as fc
 from fenics_contact.methods.method import SolverContext, StandaloneMethod
 from fenics_contact.methods.solver import METHODS
+from scenes.block_on_ball import PATH, BlockOnBall, have_equal_states, loaded_block, solve_path
 from scenes.blocks import TOP
-from scenes.comparing import at_points, close, gathered, nodal, raised_everywhere
-from scenes.rubbing import PATH, Rub, pressed, same_states, walk
+from scenes.comparison import (
+    assert_raised_on_all_ranks,
+    gather,
+    is_close,
+    nodal_values,
+    point_values,
+)
 
 pytestmark = [
     pytest.mark.newest,
@@ -30,10 +36,10 @@ def test_options_reach_the_solver(method):
     """Options set the tolerance and the iteration limit, and do not remain in the database."""
     database = PETSc.Options()
     before = database.getAll()
-    made = Rub(method=method, petsc_options={"snes_max_it": 1, "snes_rtol": 1e-5})
+    made = BlockOnBall(method=method, petsc_options={"snes_max_it": 1, "snes_rtol": 1e-5})
     assert database.getAll() == before
     assert made.problem.snes.getTolerances()[0] == 1e-5
-    made.move(0.02, 0.05)
+    made.set_top_displacement(0.02, 0.05)
     with pytest.raises(fc.NotConverged) as caught:
         made.problem.solve()
     assert caught.value.iterations == 1
@@ -46,9 +52,9 @@ def test_options_database_overrides_arguments():
     database.setValue(key, 1)
     try:
         before = database.getAll()
-        made = Rub(petsc_options={"snes_max_it": 500}, prefix="mine_")
+        made = BlockOnBall(petsc_options={"snes_max_it": 500}, prefix="mine_")
         assert database.getAll() == before
-        made.move(0.02, 0.05)
+        made.set_top_displacement(0.02, 0.05)
         with pytest.raises(fc.NotConverged) as caught:
             made.problem.solve()
         assert caught.value.iterations == 1
@@ -65,12 +71,12 @@ def test_options_database_changes_the_method():
     for key, value in given.items():
         database.setValue(key, value)
     try:
-        made = Rub(prefix="other_")
+        made = BlockOnBall(prefix="other_")
     finally:
         for key in given:
             database.delValue(key)
     assert made.problem.snes.getType() == "newtonls"
-    made.move(*PATH[0])
+    made.set_top_displacement(*PATH[0])
     made.problem.solve()
     if COMM.size == 1:
         assert made.problem.snes.getKSP().getPC().getFactorSolverType() == "petsc"
@@ -80,11 +86,11 @@ def test_two_prefixes_are_independent():
     """Two problems with different prefixes each use their own options."""
     database = PETSc.Options()
     before = database.getAll()
-    short = Rub(prefix="short_", petsc_options={"snes_max_it": 3})
-    long = Rub(prefix="long_")
+    short = BlockOnBall(prefix="short_", petsc_options={"snes_max_it": 3})
+    long = BlockOnBall(prefix="long_")
     assert database.getAll() == before
     for made in (short, long):
-        made.move(0.02, 0.03)
+        made.set_top_displacement(0.02, 0.03)
     with pytest.raises(fc.NotConverged):
         short.problem.solve()
     step = long.problem.solve()
@@ -160,24 +166,24 @@ def test_user_written_newton_solver_agrees(cell, degree):
     Tolerances over the whole path, relative to the largest value: 1e-8 for u, 1e-7 for tractions
     and slip. `ContactProblem` is solved to 1e-11 of the forces.
     """
-    made = Rub(cell=cell, degree=degree, petsc_options={"snes_rtol": 1e-11})
-    mine = Rub(cell=cell, degree=degree)
+    made = BlockOnBall(cell=cell, degree=degree, petsc_options={"snes_rtol": 1e-11})
+    mine = BlockOnBall(cell=cell, degree=degree)
     scene = mine.scene
-    bcs = [scene.hold(TOP, i, c) for i, c in enumerate(mine.push)]
+    bcs = [scene.dirichlet_bc(TOP, i, c) for i, c in enumerate(mine.push)]
     own = OwnNewton(scene.F, mine.contact, scene.u, bcs)
     for side, down in PATH:
-        made.move(side, down)
+        made.set_top_displacement(side, down)
         made.problem.solve()
         made.problem.commit()
-        mine.move(side, down)
+        mine.set_top_displacement(side, down)
         own.solve()
         mine.contact.commit()
         for name in ("traction", "slip"):
-            a, b = (at_points(m.contact, getattr(m.contact, name)) for m in (mine, made))
-            assert close(a, b, 1e-7, scale=max(np.abs(b).max(), 1e-3)), (name, side, down)
-        a, b = (nodal(m.scene.u) for m in (mine, made))
-        assert close(a, b, 1e-8), (side, down)
-    assert gathered(COMM, made.contact.slip).max() > 1e-3
+            a, b = (point_values(m.contact, getattr(m.contact, name)) for m in (mine, made))
+            assert is_close(a, b, 1e-7, scale=max(np.abs(b).max(), 1e-3)), (name, side, down)
+        a, b = (nodal_values(m.scene.u) for m in (mine, made))
+        assert is_close(a, b, 1e-8), (side, down)
+    assert gather(COMM, made.contact.slip).max() > 1e-3
     for thing in (own.matrix, own.vector, own.x, own.snes):
         thing.destroy()
 
@@ -191,21 +197,25 @@ def test_supported_snes_types_agree(kind, condensation):
     Both are solved to 1e-9 of the forces; the states agree to 1e-6.
     """
     made, usual = (
-        Rub(method="newton", condensation=condensation, petsc_options=options)
+        BlockOnBall(method="newton", condensation=condensation, petsc_options=options)
         for options in ({"snes_type": kind}, {})
     )
     for one in (made, usual):
-        walk(one, path=PATH[:3])
+        solve_path(one, path=PATH[:3])
     assert made.problem.snes.getType() == kind
-    assert same_states(made, usual, 1e-6)
+    assert have_equal_states(made, usual, 1e-6)
 
 
 @pytest.mark.whole
 @pytest.mark.parametrize("kind", ["vinewtonrsls", "fas", "newton", "ksponly"])
 def test_unsupported_snes_types_are_refused(kind):
     """Types of SNES that require bounds or a hierarchy, or that do not exist, are refused."""
-    raised_everywhere(
-        lambda: Rub(petsc_options={"snes_type": kind}), ValueError, "snes_type", kind, "newtonls"
+    assert_raised_on_all_ranks(
+        lambda: BlockOnBall(petsc_options={"snes_type": kind}),
+        ValueError,
+        "snes_type",
+        kind,
+        "newtonls",
     )
 
 
@@ -232,8 +242,10 @@ def test_user_defined_method_agrees(monkeypatch, condensation):
     monkeypatch.setitem(METHODS, "plain", Plain)
     law, states = fc.Coulomb(0.3, k_n=2e3, k_t=1e3), []
     for method in ("plain", "newton"):
-        scene, problem, _ = pressed("quadrilateral", law, method, n=3, condensation=condensation)
+        scene, problem, _ = loaded_block(
+            "quadrilateral", law, method, n=3, condensation=condensation
+        )
         step = problem.solve()
         assert (step.method, step.verdict.failures) == (method, [])
-        states.append(nodal(scene.u))
-    assert close(*states, 1e-6)
+        states.append(nodal_values(scene.u))
+    assert is_close(*states, 1e-6)

@@ -6,9 +6,9 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from scenes.block_on_ball import PATH, BlockOnBall, solve_path
 from scenes.blocks import BOTTOM, RIGHT, TOP, block
-from scenes.comparing import close, gathered, nodal, owned, same_field
-from scenes.rubbing import PATH, Rub, walk
+from scenes.comparison import gather, is_close, is_interpolant, nodal_values, owned_values
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
@@ -26,7 +26,7 @@ def test_two_contacts_without_dirichlet_conditions_along_the_load(cell, method):
     Dirichlet condition constrains the third direction. Tolerance 1e-10, as in `test_patch`.
     """
     scene = block(cell, up=-2.0, nu=0.0)
-    scene.pull(RIGHT, scene.vector(side=-1.0))
+    scene.add_traction(RIGHT, scene.vector(side=-1.0))
     wall = scene.wall(fc.Frictionless(k_n=500.0))
     floor = scene.contact(fc.Frictionless(k_n=5e3), name="floor")
     bcs = scene.rollers()[1:]
@@ -43,7 +43,7 @@ def test_two_contacts_without_dirichlet_conditions_along_the_load(cell, method):
         rows[-1] = -2.0 / 5e3 - 2.0 / 1000 * x[scene.dim - 1]
         return np.vstack(rows)
 
-    assert same_field(scene.u, exact, 1e-10)
+    assert is_interpolant(scene.u, exact, 1e-10)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -58,7 +58,7 @@ def test_all_points_stick(method):
         r = step.contacts["contact"]
         assert r.slip == 0 and r.stick > 0
         # Equilibrium, to ten times the tolerance of the solver.
-        assert close(r.force, -scene.vector(side=side, up=-1.0), 1e-8)
+        assert is_close(r.force, -scene.vector(side=side, up=-1.0), 1e-8)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -71,12 +71,12 @@ def test_prescribed_normal_traction(cell, method):
     """
     scene = block(cell, nu=0.0)
     aside = fem.Constant(scene.mesh, 0.0)
-    bcs = [scene.hold(TOP, i, aside if i == 0 else 0.0) for i in range(scene.dim)]
+    bcs = [scene.dirichlet_bc(TOP, i, aside if i == 0 else 0.0) for i in range(scene.dim)]
     law = fc.Tresca(0.3, 4.0, k_t=1e4, unilateral=False)
     problem, contact = scene.problem(law, bcs, method=method, contact={"gap": 0.5})
     step = problem.solve()
     problem.commit()
-    assert close(step.contacts["contact"].force, scene.vector(up=4.0), 1e-8)
+    assert is_close(step.contacts["contact"].force, scene.vector(up=4.0), 1e-8)
     for side in (0.1, -0.1):
         aside.value = side
         r = problem.solve().contacts["contact"]
@@ -85,8 +85,8 @@ def test_prescribed_normal_traction(cell, method):
         assert r.tangential_force == pytest.approx(0.3 * 4.0, rel=1e-8)
         # Friction opposes the motion; in 3D slip directions vary a little with the mesh.
         against = scene.vector(side=-np.sign(side) * 1.2, up=4.0)
-        assert close(r.force, against, 1e-8 if scene.dim == 2 else 2e-3)
-    assert np.all(gathered(COMM, contact.slip).sum(axis=1) > 0.1)
+        assert is_close(r.force, against, 1e-8 if scene.dim == 2 else 2e-3)
+    assert np.all(gather(COMM, contact.slip).sum(axis=1) > 0.1)
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
@@ -98,23 +98,25 @@ def test_tresca_friction(cell):
     fields = []
     for method in ("lbfgs", "newton"):
         law = fc.Tresca(0.3, 8.0, k_n=2e4, k_t=1e4)
-        made = Rub(law, cell=cell, method=method, mesh={"n": 4 if cell == "quadrilateral" else 2})
-        steps = walk(made, path=PATH[:4])
+        made = BlockOnBall(
+            law, cell=cell, method=method, mesh={"n": 4 if cell == "quadrilateral" else 2}
+        )
+        steps = solve_path(made, path=PATH[:4])
         for step in steps:
             r = step.contacts["contact"]
             assert r.tangential_force <= 0.3 * 8.0 * (1 + 1e-10)
-        fields.append(nodal(made.scene.u))
-    assert close(*fields, 1e-7)
+        fields.append(nodal_values(made.scene.u))
+    assert is_close(*fields, 1e-7)
 
 
 @pytest.mark.parametrize(("alpha", "phi"), [(1.0, 0.0), (0.5, 0.5), (0.0, 0.0)])
 def test_contact_stiffness_in_h0_does_not_change_the_solution(alpha, phi):
     """Solutions do not depend on the contact stiffness that H₀ contains, to 1e-7."""
-    reference, made = Rub(), Rub(alpha=alpha, phi=phi)
+    reference, made = BlockOnBall(), BlockOnBall(alpha=alpha, phi=phi)
     for m in (reference, made):
-        walk(m, path=PATH[:4])
-    a, b = (nodal(m.scene.u) for m in (made, reference))
-    assert close(a, b, 1e-7)
+        solve_path(m, path=PATH[:4])
+    a, b = (nodal_values(m.scene.u) for m in (made, reference))
+    assert is_close(a, b, 1e-7)
 
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
@@ -127,8 +129,8 @@ def test_patch_with_vertex_quadrature(cell):
     problem, contact = scene.problem(fc.Frictionless(k_n=5e3), scene.rollers(), petsc_options=TIGHT)
     step = problem.solve()
     assert step.contacts["contact"].normal_force == pytest.approx(2.0, rel=1e-10)
-    pressure = gathered(COMM, contact.pressure)
-    assert close(pressure, np.full(len(pressure), 2.0), 1e-10)
+    pressure = gather(COMM, contact.pressure)
+    assert is_close(pressure, np.full(len(pressure), 2.0), 1e-10)
 
 
 def test_two_contact_laws_in_one_problem():
@@ -137,7 +139,7 @@ def test_two_contact_laws_in_one_problem():
     Wall and friction balance the side load 1, the floor the vertical load 2.
     """
     scene = block("quadrilateral", up=-2.0)
-    scene.pull(RIGHT, scene.vector(side=-1.0))
+    scene.add_traction(RIGHT, scene.vector(side=-1.0))
     wall = scene.wall(fc.Frictionless(k_n=500.0))
     floor = scene.contact(fc.Coulomb(0.2, k_n=5e3, k_t=1e3), name="floor")
     problem = fc.ContactProblem(scene.F, scene.u, contacts=[wall, floor])
@@ -160,11 +162,11 @@ def test_no_force_remains_after_unloading(method):
     problem, _ = scene.problem(fc.Frictionless(k_n=1e4), scene.rollers(), method=method)
     problem.solve()
     problem.commit()
-    size = float(np.abs(gathered(COMM, owned(scene.u))).max())
+    size = float(np.abs(gather(COMM, owned_values(scene.u))).max())
     scene.load(up=0.0)
     step = problem.solve()
     assert step.contacts["contact"].normal_force <= 1e-8
-    u = gathered(COMM, owned(scene.u)).reshape(-1, 2)
+    u = gather(COMM, owned_values(scene.u)).reshape(-1, 2)
     strained = u - u.mean(axis=0)  # the block may be a little above the floor
     assert np.abs(strained).max() <= 1e-7 * size
 
@@ -174,11 +176,11 @@ def test_problem_without_contacts_is_linear(method):
     """A block without contacts, under its load with ν = 0, has the exact u to 1e-9."""
     scene = block("quadrilateral", nu=0.0, up=-2.0)
     problem = fc.ContactProblem(
-        scene.F, scene.u, bcs=[*scene.rollers(), scene.hold(BOTTOM, 1)], method=method
+        scene.F, scene.u, bcs=[*scene.rollers(), scene.dirichlet_bc(BOTTOM, 1)], method=method
     )
     step = problem.solve()
     assert step.contacts == {} and step.factorisations <= 2
-    assert same_field(scene.u, lambda x: np.vstack([0 * x[0], -2e-3 * x[1]]), 1e-9)
+    assert is_interpolant(scene.u, lambda x: np.vstack([0 * x[0], -2e-3 * x[1]]), 1e-9)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -189,7 +191,7 @@ def test_lifting_off_resets_friction(method):
     """
     scene = block("quadrilateral")
     push = [fem.Constant(scene.mesh, 0.0) for _ in range(2)]
-    bcs = [scene.hold(TOP, i, c) for i, c in enumerate(push)]
+    bcs = [scene.dirichlet_bc(TOP, i, c) for i, c in enumerate(push)]
     problem, contact = scene.problem(fc.Coulomb(0.3, k_n=1e4, k_t=5e3), bcs, method=method)
     forces = []
     # Down; sideways, slipping; up; back without contact; down again.
@@ -199,6 +201,6 @@ def test_lifting_off_resets_friction(method):
         problem.commit()
         if up > 0:
             assert np.all(forces[-1] == 0.0)
-            assert np.all(gathered(COMM, contact.tangential_traction) == 0.0)
+            assert np.all(gather(COMM, contact.tangential_traction) == 0.0)
     assert abs(forces[1][0]) > 0.1
-    assert close(forces[-1], forces[0], 1e-8)
+    assert is_close(forces[-1], forces[0], 1e-8)

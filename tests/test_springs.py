@@ -10,10 +10,10 @@ from petsc4py import PETSc
 import fenics_contact as fc
 from fenics_contact.checks.verdict import check_laws
 from scenes.blocks import BOTTOM, CELLS, LEFT, TOP, block, block_mesh, dimension
-from scenes.comparing import close, gathered, nodal, raised_everywhere
+from scenes.comparison import assert_raised_on_all_ranks, gather, is_close, nodal_values
 from scenes.elasticity import displacement_space, strain, stress
-from scenes.tags import sides
-from scenes.two_blocks import LOWER, UPPER, two_blocks
+from scenes.tags import tag_by_nodes
+from scenes.two_blocks import LOWER_FACE, UPPER_FACE, two_blocks
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
@@ -44,7 +44,7 @@ def dense(matrix: PETSc.Mat, d: int) -> np.ndarray:
     n = matrix.getSize()[0]
     matrix.destroy()
     full = np.zeros((n, n))
-    for i, j, a in zip(*(gathered(COMM, x) for x in (rows, columns, values)), strict=True):
+    for i, j, a in zip(*(gather(COMM, x) for x in (rows, columns, values)), strict=True):
         full[i, j] += a
     return full.reshape(n // d, d, n // d, d).transpose(0, 2, 1, 3)
 
@@ -52,7 +52,7 @@ def dense(matrix: PETSc.Mat, d: int) -> np.ndarray:
 def nodes(space: fem.FunctionSpace) -> np.ndarray:
     """Return the coordinates of all nodes in the global order, on every rank."""
     n = space.dofmap.index_map.size_local
-    return gathered(COMM, space.tabulate_dof_coordinates()[:n, : space.mesh.geometry.dim])
+    return gather(COMM, space.tabulate_dof_coordinates()[:n, : space.mesh.geometry.dim])
 
 
 @pytest.mark.parametrize("weight", ["none", "varying"])
@@ -86,15 +86,15 @@ def test_springs_of_an_inclined_surface(cell, n, weight):
         expected = np.zeros_like(matrix)
         for node in np.flatnonzero(on_surface):
             expected[node, node] = block_of_node
-        assert close(matrix, expected, 1e-13)
+        assert is_close(matrix, expected, 1e-13)
     assert np.count_nonzero(on_surface) == (n + 1) ** (d - 1)
     # A uniform penetration of 0.2 causes a force of 0.2 k_n at every node.
     u.x.array[:] = np.tile(0.3 * normal, u.x.array.size // d)
     force = fem.Function(space)
     fc.ContactOperator(contact).add_force(force.x.petsc_vec)
     n_owned = space.dofmap.index_map.size_local
-    force = gathered(COMM, force.x.array.reshape(-1, d)[:n_owned])
-    assert close(force, np.outer(on_surface, 0.2 * K_N * normal), 1e-12)
+    force = gather(COMM, force.x.array.reshape(-1, d)[:n_owned])
+    assert is_close(force, np.outer(on_surface, 0.2 * K_N * normal), 1e-12)
 
 
 @pytest.mark.parametrize("cell", CELLS)
@@ -112,8 +112,8 @@ def test_springs_between_two_bodies(cell):
     x = nodes(space)
     contact = fc.Contact(
         fem.Function(space),
-        fc.ContactSurface(mesh, tags, LOWER, **VERTEX),
-        fc.DeformableBody(tags, UPPER),
+        fc.ContactSurface(mesh, tags, LOWER_FACE, **VERTEX),
+        fc.DeformableBody(tags, UPPER_FACE),
         fc.Coulomb(0.3, k_n=fc.NodalSprings(K_N), k_t=fc.NodalSprings(K_T)),
     )
     assert contact.n_unpaired == 0
@@ -125,7 +125,7 @@ def test_springs_between_two_bodies(cell):
             (j,) = (j for j in middle if j != i and np.allclose(x[i], x[j], atol=1e-12))
             expected[i, i] = block_of_pair
             expected[i, j] = -block_of_pair
-        assert close(matrix, expected, 1e-9)
+        assert is_close(matrix, expected, 1e-9)
     assert len(middle) == 2 * 3 ** (d - 1)
 
 
@@ -143,18 +143,20 @@ def test_springs_use_the_present_parameters():
     assert np.count_nonzero(np.abs(matrix) > 1e-13) == 3
     assert matrix.max() == pytest.approx(5.0, rel=1e-13)
     contact.parameters["weight"].value = 0.0
-    raised_everywhere(contact.check_input, ValueError, "contact", "area of a vertex", "weight")
+    assert_raised_on_all_ranks(
+        contact.check_input, ValueError, "contact", "area of a vertex", "weight"
+    )
 
 
 def test_nodal_springs_require_vertex_quadrature_and_positive_k():
     """`NodalSprings` are refused without vertex quadrature, or if k is not a positive number."""
     scene = block()
     for law in (fc.Frictionless(fc.NodalSprings(1.0)), fc.Coulomb(0.3, k_t=fc.NodalSprings(1.0))):
-        raised_everywhere(
+        assert_raised_on_all_ranks(
             lambda law=law: scene.contact(law), ValueError, "contact", "'default'", "vertex"
         )
     for value in (0.0, -1.0, np.nan, np.inf, "stiff", None):
-        raised_everywhere(
+        assert_raised_on_all_ranks(
             lambda value=value: fc.NodalSprings(value), ValueError, repr(value), "greater than zero"
         )
 
@@ -186,10 +188,10 @@ def test_bulk_spring_added_later_constrains_the_body(bulk):
     problem.solve()
     problem.commit()
     stretched = COMM.allreduce(fem.assemble_scalar(fem.form(k * u[0] * side)))
-    assert close(contact.resultants().force[0] + 0.5, stretched, 1e-7)
+    assert is_close(contact.resultants().force[0] + 0.5, stretched, 1e-7)
     assert stretched > 0.19
     k.value = 0.0
-    raised_everywhere(problem.solve, (ValueError, fc.NotConverged))
+    assert_raised_on_all_ranks(problem.solve, (ValueError, fc.NotConverged))
 
 
 # ---- foundations ---------------------------------------------------------------------------------
@@ -210,12 +212,12 @@ def test_block_on_foundation(cell, method):
         step = problem.solve()
         problem.commit()
         found = step.contacts["contact"]
-        assert close(found.force, -scene.vector(side=side, up=up), 1e-7, scale=1.0)
+        assert is_close(found.force, -scene.vector(side=side, up=up), 1e-7, scale=1.0)
         assert found.normal_force == pytest.approx(-up, abs=1e-7)
-        jump = gathered(COMM, contact.values.jump)
-        measure = gathered(COMM, contact.measure)
+        jump = gather(COMM, contact.values.jump)
+        measure = gather(COMM, contact.measure)
         expected = scene.vector(side=side / 20.0, up=up / 50.0)
-        assert close(measure @ jump, expected, 1e-7, scale=0.02)
+        assert is_close(measure @ jump, expected, 1e-7, scale=0.02)
         assert found.open == found.slip == 0 and found.area == pytest.approx(1.0, rel=1e-12)
         assert set(step.verdict.laws["contact"]) == {"stiffness"}
         assert step.verdict.laws["contact"]["stiffness"] <= 1e-10
@@ -228,28 +230,28 @@ def test_foundation_without_tension():
     """
     scene = block("quadrilateral", up=-2.0)
     law = fc.Foundation(50.0, 20.0, tension=False)
-    problem, contact = scene.problem(law, [scene.hold(LEFT, 0)])
+    problem, contact = scene.problem(law, [scene.dirichlet_bc(LEFT, 0)])
     step = problem.solve()
     assert step.contacts["contact"].normal_force == pytest.approx(2.0, abs=1e-7)
     assert set(step.verdict.laws["contact"]) == {"complementarity", "stiffness"}
     assert max(step.verdict.laws["contact"].values()) <= 1e-10
-    assert np.all(gathered(COMM, contact.status) == fc.Status.STICK)
+    assert np.all(gather(COMM, contact.status) == fc.Status.STICK)
     scene.load(up=0.5)
-    raised_everywhere(problem.solve, ValueError, "balance")
+    assert_raised_on_all_ranks(problem.solve, ValueError, "balance")
 
 
 def test_foundation_without_tangential_stiffness_has_no_slip_history():
     """With k_t = 0 there are no tangential tractions or history, nor is the body constrained."""
     scene = block("quadrilateral", up=0.5)
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: scene.problem(fc.Foundation(50.0), []), ValueError, "translation along x"
     )
-    problem, contact = scene.problem(fc.Foundation(50.0), [scene.hold(LEFT, 0)])
+    problem, contact = scene.problem(fc.Foundation(50.0), [scene.dirichlet_bc(LEFT, 0)])
     step = problem.solve()
     assert step.contacts["contact"].normal_force == pytest.approx(-0.5, abs=1e-7)
-    assert np.all(gathered(COMM, contact.status) == fc.Status.SLIP)
+    assert np.all(gather(COMM, contact.status) == fc.Status.SLIP)
     assert "traction" not in contact.history and "traction" not in contact.values.arrays
-    assert not np.any(gathered(COMM, contact.tangential_traction))
+    assert not np.any(gather(COMM, contact.tangential_traction))
 
 
 @pytest.mark.parametrize("tension", [True, False])
@@ -265,14 +267,14 @@ def test_foundation_on_half_of_the_surface(tension):
             law = fc.Foundation(k_n, k_t, tension=tension)
         else:
             left = {1: lambda x: np.isclose(x[1], 0.0) & (x[0] < 0.5 + 1e-9)}
-            scene.surface = fc.ContactSurface(scene.mesh, sides(scene.mesh, left), 1)
-        problem, _ = scene.problem(law, [scene.hold(LEFT, 0)], petsc_options=TIGHT)
+            scene.surface = fc.ContactSurface(scene.mesh, tag_by_nodes(scene.mesh, left), 1)
+        problem, _ = scene.problem(law, [scene.dirichlet_bc(LEFT, 0)], petsc_options=TIGHT)
         step = problem.solve()
         assert max(step.verdict.laws["contact"].values()) <= 1e-10
         force = step.contacts["contact"]
-        found.append((nodal(scene.u), np.append(force.force, force.max_pressure)))
+        found.append((nodal_values(scene.u), np.append(force.force, force.max_pressure)))
     for one, other in zip(*found, strict=True):
-        assert close(one, other, 1e-8)
+        assert is_close(one, other, 1e-8)
 
 
 @pytest.mark.parametrize("tension", [True, False])
@@ -285,14 +287,14 @@ def test_foundation_of_zero_stiffness(tension, constant):
     """
     scene = block("quadrilateral")
     k = fem.Constant(scene.mesh, 0.0) if constant else 0.0
-    held = [scene.hold(TOP, i) for i in range(2)]
+    held = [scene.dirichlet_bc(TOP, i) for i in range(2)]
     problem, _ = scene.problem(fc.Foundation(k, tension=tension), held)
     step = problem.solve()
     assert step.contacts["contact"].normal_force == 0.0
-    assert not np.any(gathered(COMM, scene.u.x.array))
-    problem, _ = scene.problem(fc.Foundation(k, tension=tension), [scene.hold(LEFT, 0)])
+    assert not np.any(gather(COMM, scene.u.x.array))
+    problem, _ = scene.problem(fc.Foundation(k, tension=tension), [scene.dirichlet_bc(LEFT, 0)])
     scene.load(up=-1.0)
-    raised_everywhere(problem.solve, ValueError, "no contact force can balance", "along y")
+    assert_raised_on_all_ranks(problem.solve, ValueError, "no contact force can balance", "along y")
     if constant:  # solvable with a positive stiffness
         k.value = 50.0
         assert problem.solve().contacts["contact"].normal_force == pytest.approx(1.0, abs=1e-7)
@@ -362,7 +364,7 @@ def test_sliding_direction_of_anisotropic_friction(cell, kind, method):
     options, expected = SLIDING[kind]
     scene = block(cell)
     push = [fem.Constant(scene.mesh, 0.0) for _ in range(3)]
-    bcs = [scene.hold(TOP, i, c) for i, c in enumerate(push)]
+    bcs = [scene.dirichlet_bc(TOP, i, c) for i, c in enumerate(push)]
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4, **options)
     problem, _ = scene.problem(law, bcs, method=method)
     for number in range(5):
@@ -372,7 +374,7 @@ def test_sliding_direction_of_anisotropic_friction(cell, kind, method):
         problem.commit()
     found = step.contacts["contact"]
     assert found.slip > 0 and found.stick == 0
-    assert close(found.force[:2] / found.normal_force, -expected, 1e-6)
+    assert is_close(found.force[:2] / found.normal_force, -expected, 1e-6)
     assert {"cone", "slip", "dissipation"} <= set(step.verdict.laws["contact"])
 
 
@@ -413,7 +415,7 @@ def test_verdict_rejects_wrong_anisotropic_law(what, claim):
     contact = scene.contact(law)
     scene.u.interpolate(lambda x: np.vstack([0.1 + 0 * x[0], 0.07 + 0 * x[0], -0.01 + 0 * x[0]]))
     contact.evaluate()
-    assert np.all(gathered(COMM, contact.status) == fc.Status.SLIP)
+    assert np.all(gather(COMM, contact.status) == fc.Status.SLIP)
     found = check_laws(contact)
     if claim:
         assert found[claim] > 1e-3

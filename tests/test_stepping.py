@@ -15,10 +15,15 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.histories import checkpoint_file
+from scenes.block_on_ball import (
+    STATE_TOLERANCE,
+    BlockOnBall,
+    fail_increments_above,
+    have_equal_states,
+)
 from scenes.blocks import TOP, block
-from scenes.comparing import close, owned, raised_everywhere, shared_folder
-from scenes.processes import command, environment
-from scenes.rubbing import SAME, Rub, limited, same_states
+from scenes.comparison import assert_raised_on_all_ranks, is_close, owned_values, shared_folder
+from scenes.processes import command, subprocess_environment
 
 pytestmark = pytest.mark.three_ranks
 
@@ -31,7 +36,7 @@ COMM = MPI.COMM_WORLD
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_one_function_can_set_several_loads(cell):
     """In a cycle of two loads set by one function the friction force is reversed."""
-    made = Rub(cell=cell)
+    made = BlockOnBall(cell=cell)
     shear = {}
     for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=8):
         shear[step.load] = made.contact.resultants().force[0]
@@ -39,12 +44,12 @@ def test_one_function_can_set_several_loads(cell):
     assert shear[2.0] < 0 < shear[4.0]
     end = made.contact.resultants()
     assert end.slip > 0 and end.stick == 0
-    assert close(end.tangential_force, 0.3 * end.normal_force, 1e-12)
+    assert is_close(end.tangential_force, 0.3 * end.normal_force, 1e-12)
 
 
 def test_increments_end_at_the_given_loads():
     """Increments of unequal size end at the given loads."""
-    made = Rub()
+    made = BlockOnBall()
     steps = fc.increments(made.problem, made.load, 0.0, 2.0, steps=[0.5, 1.0, 1.1, 2.0])
     assert [s.load for s in steps] == [0.5, 1.0, 1.1, 2.0]
     assert made.push[0].value == 0.1
@@ -66,27 +71,27 @@ def test_increments_end_at_the_given_loads():
 )
 def test_invalid_histories_are_refused(load, steps, word):
     """Refused are a load that is no load, and increments that are not monotonic or miss the end."""
-    made = Rub()
+    made = BlockOnBall()
     call = lambda: list(  # noqa: E731
         fc.increments(made.problem, load or made.load, 0.0, 1.0, steps=steps)
     )
-    raised_everywhere(call, ValueError, word)
+    assert_raised_on_all_ranks(call, ValueError, word)
 
 
 @pytest.mark.parametrize(("start", "end"), [(0.0, 5e-324), (1e16, 1e16 + 2), (-1e308, 1e308)])
 def test_increments_below_round_off_are_refused(start, end):
     """Fewer than the three increments asked for would be another load path."""
-    made = Rub()
+    made = BlockOnBall()
     call = lambda: fc.increments(made.problem, made.load, start, end, steps=3)  # noqa: E731
-    raised_everywhere(call, ValueError, "steps is 3", "distinguished")
+    assert_raised_on_all_ranks(call, ValueError, "steps is 3", "distinguished")
 
 
 def test_same_file_for_checkpoint_and_csv_is_refused(tmp_path):
     """Each would overwrite the other; nothing is written."""
-    made, path = Rub(), shared_folder(tmp_path) / "state"
+    made, path = BlockOnBall(), shared_folder(tmp_path) / "state"
     names = {"checkpoint": path, "csv": path.parent / ".." / path.parent.name / "state"}
     call = lambda: fc.increments(made.problem, made.load, **names)  # noqa: E731
-    raised_everywhere(call, ValueError, "checkpoint and csv are both")
+    assert_raised_on_all_ranks(call, ValueError, "checkpoint and csv are both")
     assert not path.exists()
 
 
@@ -95,26 +100,26 @@ def test_same_file_for_checkpoint_and_csv_is_refused(tmp_path):
 
 def test_failed_increments_are_cut_and_enlarged_again():
     """Increments are halved until they converge, doubled after two successes, and reach the end."""
-    made, plain = Rub(), Rub()
-    tried = limited(made, 0.3)
+    made, plain = BlockOnBall(), BlockOnBall()
+    tried = fail_increments_above(made, 0.3)
     done = [s.load for s in fc.increments(made.problem, made.load, 0.0, 2.0, steps=2)]
     assert done[-1] == 2.0 and 1.0 in done
     assert np.all(np.diff([0.0, *done]) <= 0.3)
     assert len(tried) > len(done)  # increments failed, also after growth
     asked = list(fc.increments(plain.problem, plain.load, 0.0, 2.0, steps=done))
     assert made.problem.increment == len(asked) == len(done)
-    assert same_states(made, plain, 1e-7)
+    assert have_equal_states(made, plain, 1e-7)
 
 
 def test_number_of_cuts_is_limited():
     """An increment that never converges raises the error, and the committed state is unchanged."""
-    made = Rub()
-    limited(made, 0.0)
+    made = BlockOnBall()
+    fail_increments_above(made, 0.0)
     with pytest.raises(fc.NotConverged):
         list(fc.increments(made.problem, made.load, 0.0, 1.0, max_cuts=3))
     assert made.problem.increment == 0
     assert made.push[1].value == 0.0
-    assert np.all(owned(made.scene.u) == 0.0)
+    assert np.all(owned_values(made.scene.u) == 0.0)
 
 
 # ---- energy --------------------------------------------------------------------------------------
@@ -124,13 +129,15 @@ def test_number_of_cuts_is_limited():
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_energy_is_balanced(cell, law):
     """With equilibrium at both ends the balance is exact, up to 1e-6 by the solver's 1e-9."""
-    made = Rub(law, cell=cell)
+    made = BlockOnBall(law, cell=cell)
     for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=8):
         e = step.energy
         size = abs(e.work) + abs(e.elastic)
         assert abs(e.imbalance) <= 1e-6 * size
         assert e.dissipation >= -1e-14 * size
-        assert close(e.elastic + e.springs + e.dissipation + e.remainder, e.work, 1e-12, scale=size)
+        assert is_close(
+            e.elastic + e.springs + e.dissipation + e.remainder, e.work, 1e-12, scale=size
+        )
         if not law.has_friction:
             assert e.dissipation == 0.0
 
@@ -139,7 +146,7 @@ def test_energy_remainder_converges_with_the_increments():
     """The sum of absolute remainders more than halves when the increments are halved."""
     shares = []
     for n in (8, 16, 32):
-        made = Rub()
+        made = BlockOnBall()
         steps = list(fc.increments(made.problem, made.load, 0.0, 4.0, steps=n))
         dissipated = sum(s.energy.dissipation for s in steps)
         assert dissipated > 0
@@ -154,13 +161,13 @@ def test_energy_of_a_driven_obstacle(field):
     scene = block("quadrilateral", 1, n=2, nu=0.0)
     force = fem.Constant(scene.mesh, 0.0)
     floor = scene.floor(displacement=fc.Motion(force=(None, force)))
-    bcs = [scene.hold(TOP, i) for i in range(2)]
+    bcs = [scene.dirichlet_bc(TOP, i) for i in range(2)]
     problem, _ = scene.problem(fc.Frictionless(k_n=1e4), bcs, contact={"obstacle": floor})
     force.value = 6.0
     step = problem.solve(recover_interior=field)
-    assert close(step.energy.work, 18.0 * (1 / 1e4 + 1 / 1000), 1e-7)
-    assert close(step.energy.springs, 18.0 / 1e4, 1e-7)
-    assert close(step.energy.elastic, 18.0 / 1000, 1e-7)
+    assert is_close(step.energy.work, 18.0 * (1 / 1e4 + 1 / 1000), 1e-7)
+    assert is_close(step.energy.springs, 18.0 / 1e4, 1e-7)
+    assert is_close(step.energy.elastic, 18.0 / 1000, 1e-7)
 
 
 # ---- checkpoints ---------------------------------------------------------------------------------
@@ -172,7 +179,7 @@ def test_energy_of_a_driven_obstacle(field):
 def test_restart_gives_identical_digits(cell, method, every, tmp_path):
     """A history interrupted after 5 of 8 increments is restarted by a new problem, bit for bit."""
     folder = shared_folder(tmp_path)
-    whole, broken, after = (Rub(cell=cell, method=method) for _ in range(3))
+    whole, broken, after = (BlockOnBall(cell=cell, method=method) for _ in range(3))
     options = {"steps": 8, "checkpoint_every": every}
     history = fc.increments(
         whole.problem, whole.load, 0.0, 4.0, checkpoint=folder / "whole.npz", **options
@@ -184,23 +191,25 @@ def test_restart_gives_identical_digits(cell, method, every, tmp_path):
             break
     rest = list(fc.increments(after.problem, after.load, 0.0, 4.0, checkpoint=path, **options))
     assert rest[0].increment == (6 if every == 1 else 4)
-    assert same_states(after, whole, SAME)
+    assert have_equal_states(after, whole, STATE_TOLERANCE)
     for step in rest:
         size = abs(energies[step.load].work) + abs(energies[step.load].elastic)
-        assert close(step.energy.work, energies[step.load].work, max(SAME, 1e-12), scale=size)
+        assert is_close(
+            step.energy.work, energies[step.load].work, max(STATE_TOLERANCE, 1e-12), scale=size
+        )
     # A third start finds nothing left to do.
-    again = Rub(cell=cell, method=method)
+    again = BlockOnBall(cell=cell, method=method)
     assert not list(fc.increments(again.problem, again.load, 0.0, 4.0, checkpoint=path, **options))
-    assert same_states(again, whole, SAME)
+    assert have_equal_states(again, whole, STATE_TOLERANCE)
 
 
 def test_checkpoint_of_another_problem_is_refused(tmp_path):
     """The checkpoint of another mesh is refused, and nothing is changed."""
     path = shared_folder(tmp_path) / "state.npz"
-    made = Rub()
+    made = BlockOnBall()
     list(fc.increments(made.problem, made.load, 0.0, 1.0, checkpoint=path))
-    other = Rub(cell="triangle")
-    raised_everywhere(
+    other = BlockOnBall(cell="triangle")
+    assert_raised_on_all_ranks(
         lambda: list(fc.increments(other.problem, other.load, checkpoint=path)), ValueError, "mesh"
     )
     assert other.problem.increment == 0
@@ -215,14 +224,14 @@ class LossyFile(io.FileIO):
         return len(content)
 
 
-@pytest.mark.parametrize("said", [True, False])
-def test_failed_write_keeps_the_previous_checkpoint(said, tmp_path, monkeypatch):
+@pytest.mark.parametrize("output", [True, False])
+def test_failed_write_keeps_the_previous_checkpoint(output, tmp_path, monkeypatch):
     """If the disk is full, all ranks raise the error, and the last file and state are unchanged.
 
     The same holds for a disk that loses a byte without an error, because the file is read back.
     """
     path = shared_folder(tmp_path) / "state.npz"
-    made = Rub()
+    made = BlockOnBall()
     history = fc.increments(made.problem, made.load, 0.0, 2.0, steps=4, checkpoint=path)
     next(history)
     before = path.read_bytes()
@@ -235,12 +244,12 @@ def test_failed_write_keeps_the_previous_checkpoint(said, tmp_path, monkeypatch)
         assert mode == "wb"
         return LossyFile(path, mode)
 
-    if said:
+    if output:
         monkeypatch.setattr(np, "savez", full)
     else:
         monkeypatch.setattr(checkpoint_file, "open", lossy, raising=False)
-    words = "No space left" if said else "differs from what was written"
-    raised_everywhere(lambda: next(history), (OSError, RuntimeError), words)
+    words = "No space left" if output else "differs from what was written"
+    assert_raised_on_all_ranks(lambda: next(history), (OSError, RuntimeError), words)
     assert path.read_bytes() == before
     assert COMM.allgather(os.listdir(path.parent)) == [["state.npz"]] * COMM.size
     assert made.problem.increment == 2
@@ -249,8 +258,8 @@ def test_failed_write_keeps_the_previous_checkpoint(said, tmp_path, monkeypatch)
 SCRIPT = """
 import json
 import fenics_contact as fc
-from scenes.rubbing import SAME, Rub, limited, same_states
-made = Rub()
+from scenes.block_on_ball import BlockOnBall
+made = BlockOnBall()
 first = made.scene.mesh.comm.rank == 0
 for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=40, checkpoint={path!r}):
     if first:
@@ -268,7 +277,9 @@ def run_script(path: Path, ranks: int, *, kill_after: int | None = None) -> list
     """
     script = SCRIPT.format(path=str(path))
     words = command(ranks, "-c", script)
-    process = subprocess.Popen(words, env=environment(), stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        words, env=subprocess_environment(), stdout=subprocess.PIPE, text=True
+    )
     lines = []
     for line in process.stdout:
         lines.append(line.strip())
@@ -296,4 +307,4 @@ def test_restart_of_a_killed_process(ranks, tmp_path):
     assert int(after[0]) >= 17
     if first == second:
         assert after[-1] == alone[-1]
-    assert close(json.loads(after[-1]), json.loads(alone[-1]), 1e-6)
+    assert is_close(json.loads(after[-1]), json.loads(alone[-1]), 1e-6)

@@ -5,10 +5,15 @@ import pytest
 from mpi4py import MPI
 
 import fenics_contact as fc
-from scenes.beside import Beside, Box
+from scenes.block_on_ball import (
+    STATE_TOLERANCE,
+    BlockOnBall,
+    fail_increments_above,
+    have_equal_states,
+)
 from scenes.blocks import BOTTOM, TOP
-from scenes.comparing import close, owned, raised_everywhere, shared_folder
-from scenes.rubbing import SAME, Rub, limited, same_states
+from scenes.comparison import assert_raised_on_all_ranks, is_close, owned_values, shared_folder
+from scenes.unrelated_bodies import Box, SceneWithUnrelatedBodies
 
 pytestmark = pytest.mark.three_ranks
 
@@ -17,7 +22,7 @@ COMM = MPI.COMM_WORLD
 
 def lagging(field, tmp_path=None, *, law=None, steps=8, **kwargs):
     """Run the history with ``recover_interior=field``."""
-    made = Rub(law, cell="hexahedron", condensation=True)
+    made = BlockOnBall(law, cell="hexahedron", condensation=True)
     options = {"steps": steps, "recover_interior": field} | kwargs
     return made, list(fc.increments(made.problem, made.load, 0.0, 4.0, **options))
 
@@ -33,12 +38,14 @@ def test_interior_recovered_at_the_last_increment(law):
     last, steps = lagging("last", law=law)
     assert [s.complete for s in all_steps] == [True] * 8
     assert [s.complete for s in steps] == [False] * 7 + [True]
-    assert same_states(last, every, 1e-7)
+    assert have_equal_states(last, every, 1e-7)
     for a, b in zip(steps, all_steps, strict=True):
-        assert close(a.contacts["contact"].force, b.contacts["contact"].force, 1e-7)
+        assert is_close(a.contacts["contact"].force, b.contacts["contact"].force, 1e-7)
         size = abs(b.energy.work) + abs(b.energy.elastic)
         for name in ("work", "elastic", "springs", "dissipation", "remainder"):
-            assert close(getattr(a.energy, name), getattr(b.energy, name), 1e-7, scale=size), name
+            assert is_close(getattr(a.energy, name), getattr(b.energy, name), 1e-7, scale=size), (
+                name
+            )
         assert abs(a.energy.imbalance) <= 1e-6 * size
         assert a.verdict.failures == [] and a.verdict.laws.keys() == {"contact"}
 
@@ -48,7 +55,10 @@ def test_complete_recovers_the_interior_on_request():
 
     The status of the contact in the increment is unchanged: points that slipped do not stick.
     """
-    every, lazy = Rub(cell="triangle", condensation=True), Rub(cell="triangle", condensation=True)
+    every, lazy = (
+        BlockOnBall(cell="triangle", condensation=True),
+        BlockOnBall(cell="triangle", condensation=True),
+    )
     compared = 0
     for step in fc.increments(every.problem, every.load, 0.0, 4.0, steps=8):
         made = lazy.problem
@@ -57,20 +67,20 @@ def test_complete_recovers_the_interior_on_request():
         made.commit()
         status = lazy.contact.status.copy()
         assert np.array_equal(status, every.contact.status)
-        behind = owned(lazy.scene.u).copy()
+        behind = owned_values(lazy.scene.u).copy()
         if step.increment % 3 == 0:
             verdict = made.complete()
             assert verdict.failures == [] and made.complete() is None
-            assert not close(behind, owned(every.scene.u), 1e-3)
-            assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
+            assert not is_close(behind, owned_values(every.scene.u), 1e-3)
+            assert is_close(owned_values(lazy.scene.u), owned_values(every.scene.u), 1e-7)
             assert np.array_equal(lazy.contact.status, status)
             compared += 1
     assert compared == 2
 
 
-def stiffening(field: str) -> tuple[Rub, list[fc.Step]]:
+def stiffening(field: str) -> tuple[BlockOnBall, list[fc.Step]]:
     """Run a history in which the stiffness of bulk and contact changes with the load."""
-    made = Rub(cell="triangle", condensation=True)
+    made = BlockOnBall(cell="triangle", condensation=True)
 
     def load(t: float) -> None:
         made.load(t)
@@ -87,9 +97,9 @@ def test_pending_interior_uses_the_data_of_its_increment():
     assert not lagging[0].complete
     for a, b in zip(all_found, lagging, strict=True):
         one, other = a.contacts["contact"].force, b.contacts["contact"].force
-        assert close(one, other, 1e-7)
+        assert is_close(one, other, 1e-7)
         assert np.isclose(a.energy.elastic, b.energy.elastic, rtol=1e-6)
-    assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
+    assert is_close(owned_values(lazy.scene.u), owned_values(every.scene.u), 1e-7)
 
 
 @pytest.mark.parametrize("last", [True, False], ids=["found", "behind"])
@@ -100,7 +110,7 @@ def test_uncommitted_solution_is_discarded_after_bulk_changes(last):
     """
     states = []
     for first, second in ((True, True), (False, last)):
-        made = Rub(cell="triangle", condensation=True)
+        made = BlockOnBall(cell="triangle", condensation=True)
         made.load(1.0)
         made.problem.solve(recover_interior=first)
         made.problem.commit()
@@ -113,7 +123,7 @@ def test_uncommitted_solution_is_discarded_after_bulk_changes(last):
         made.problem.complete()
         states.append([made, step.energy])
     (every, one), (lazy, other) = states
-    assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
+    assert is_close(owned_values(lazy.scene.u), owned_values(every.scene.u), 1e-7)
     assert np.isclose(one.work, other.work, rtol=1e-6)
     assert np.isclose(one.elastic, other.elastic, rtol=1e-6)
 
@@ -128,22 +138,25 @@ def test_checkpoint_with_a_pending_interior(tmp_path):
     """A history restarted from a checkpoint has the states of an uninterrupted one."""
     folder = shared_folder(tmp_path)
     whole, _ = lagging("last", checkpoint=folder / "whole.npz", checkpoint_every=3)
-    made = Rub(cell="hexahedron", condensation=True)
+    made = BlockOnBall(cell="hexahedron", condensation=True)
     options = {"steps": 8, "recover_interior": "last", "checkpoint": folder / "part.npz"}
     options["checkpoint_every"] = 3
     for step in fc.increments(made.problem, made.load, 0.0, 4.0, **options):
         if step.increment == 5:
             break
-    after = Rub(cell="hexahedron", condensation=True)
+    after = BlockOnBall(cell="hexahedron", condensation=True)
     rest = list(fc.increments(after.problem, after.load, 0.0, 4.0, **options))
     assert rest[0].increment == 4
-    assert same_states(after, whole, SAME)
+    assert have_equal_states(after, whole, STATE_TOLERANCE)
 
 
 def test_failed_increment_recovers_the_committed_interior():
     """When an increment fails, the interior of u is recovered for the last commit, 1e-7."""
-    every, lazy = Rub(cell="triangle", condensation=True), Rub(cell="triangle", condensation=True)
-    limited(lazy, 0.6)
+    every, lazy = (
+        BlockOnBall(cell="triangle", condensation=True),
+        BlockOnBall(cell="triangle", condensation=True),
+    )
+    fail_increments_above(lazy, 0.6)
     for made in (every, lazy):
         options = {
             "steps": [0.5, 4.0] if made is lazy else [0.5],
@@ -155,15 +168,18 @@ def test_failed_increment_recovers_the_committed_interior():
             list(history)
         else:
             next(history)
-            assert not close(owned(lazy.scene.u), owned(every.scene.u), 1e-3)
+            assert not is_close(owned_values(lazy.scene.u), owned_values(every.scene.u), 1e-3)
             with pytest.raises(fc.NotConverged):
                 next(history)
-    assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
+    assert is_close(owned_values(lazy.scene.u), owned_values(every.scene.u), 1e-7)
 
 
 def test_failed_solve_keeps_the_uncommitted_solution():
     """A failed solve keeps an uncommitted solution; its interior can be recovered, 1e-7."""
-    every, lazy = Rub(cell="triangle", condensation=True), Rub(cell="triangle", condensation=True)
+    every, lazy = (
+        BlockOnBall(cell="triangle", condensation=True),
+        BlockOnBall(cell="triangle", condensation=True),
+    )
     for made in (every, lazy):
         for t in (0.5, 1.5):
             made.load(t)
@@ -177,12 +193,12 @@ def test_failed_solve_keeps_the_uncommitted_solution():
     assert np.array_equal(lazy.contact.pressure, pressure)
     lazy.load(1.5)
     lazy.problem.complete()
-    assert close(owned(lazy.scene.u), owned(every.scene.u), 1e-7)
+    assert is_close(owned_values(lazy.scene.u), owned_values(every.scene.u), 1e-7)
 
 
 def test_wrong_recovered_interior_is_refused(monkeypatch):
     """A recovered interior is verified by the product with K, not by its own factors."""
-    made = Rub(cell="triangle", condensation=True)
+    made = BlockOnBall(cell="triangle", condensation=True)
     made.load(1.0)
     made.problem.solve(recover_interior=False)
     made.problem.commit()
@@ -194,19 +210,19 @@ def test_wrong_recovered_interior_is_refused(monkeypatch):
 
 def test_wrong_recover_interior_is_refused():
     """An unknown value of ``recover_interior`` raises an error."""
-    made = Rub()
+    made = BlockOnBall()
     for field in ("never", 0, 1.5):
         call = lambda field=field: list(  # noqa: E731
             fc.increments(made.problem, made.load, recover_interior=field)
         )
-        raised_everywhere(call, ValueError, "every")
+        assert_raised_on_all_ranks(call, ValueError, "every")
 
 
 def test_body_without_contact_balances_with_a_pending_interior():
     """A body without retained dofs, whose forces on these are 0 of 0, balances before and after."""
-    scene = Beside({"block": Box(), "other": Box((3.0, 0.0))})
-    scene.hold("block", TOP, 0, 1, value=-1e-3)
-    scene.hold("other", BOTTOM, 0, 1)
+    scene = SceneWithUnrelatedBodies({"block": Box(), "other": Box((3.0, 0.0))})
+    scene.prescribe("block", TOP, 0, 1, value=-1e-3)
+    scene.prescribe("other", BOTTOM, 0, 1)
     scene.load("other", TOP, 0, scene.bodies.constant(1e-3))
     floor = fc.HalfSpace((0.0, 0.0), (0.0, 1.0))
     contact = scene.contact("block", BOTTOM, floor, fc.Frictionless(), name="floor")

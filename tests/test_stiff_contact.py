@@ -12,9 +12,9 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes import problems, two_blocks
+from scenes.block_on_ball import BlockOnBall, loaded_block, supporting_ball
 from scenes.blocks import TOP, block, kirchhoff
-from scenes.comparing import close, nodal, same_effort
-from scenes.rubbing import Rub, cushion, pressed
+from scenes.comparison import have_similar_iterations, is_close, nodal_values
 
 pytestmark = pytest.mark.two_ranks
 
@@ -33,10 +33,10 @@ def test_solution_agrees_with_minimum_problems_at_any_stiffness(cell, degree, k)
     """At any stiffness Newton's method finds the solution of the minimum problems, to 1e-6."""
     states = []
     for method in ("newton", "alternating"):
-        scene, problem, _ = pressed(cell, coulomb(k), method, degree=degree, n=3, side=0.06)
+        scene, problem, _ = loaded_block(cell, coulomb(k), method, degree=degree, n=3, side=0.06)
         assert (problem.solve().method == "alternating") == (method == "alternating")
-        states.append(nodal(scene.u))
-    assert close(*states, 1e-6)
+        states.append(nodal_values(scene.u))
+    assert is_close(*states, 1e-6)
 
 
 @pytest.mark.each
@@ -54,10 +54,10 @@ def test_other_laws_agree_with_minimum_problems(law):
     """Other friction surfaces and k_n ≠ k_t have the solution of the minimum problems, to 1e-6."""
     states = []
     for method in ("newton", "alternating"):
-        scene, problem, _ = pressed("hexahedron", law, method, n=3, side=0.06)
+        scene, problem, _ = loaded_block("hexahedron", law, method, n=3, side=0.06)
         assert (problem.solve().method == "alternating") == (method == "alternating")
-        states.append(nodal(scene.u))
-    assert close(*states, 1e-6)
+        states.append(nodal_values(scene.u))
+    assert is_close(*states, 1e-6)
 
 
 @pytest.mark.parametrize("condensation", [True, False])
@@ -65,12 +65,14 @@ def test_load_reversals_agree_with_continuation(condensation):
     """A history with load reversals agrees with that of continuation, to 1e-6."""
     ends = []
     for method in ("newton", "continuation"):
-        rub = Rub(coulomb(1e3), mesh={"n": 8}, reach=0.05, method=method, condensation=condensation)
+        rub = BlockOnBall(
+            coulomb(1e3), mesh={"n": 8}, amplitude=0.05, method=method, condensation=condensation
+        )
         steps = list(fc.increments(rub.problem, rub.load, 0.0, 4.0, steps=8, max_cuts=0))
         assert all(step.energy.dissipation >= 0 for step in steps)
         assert method in [step.method for step in steps]
-        ends.append(nodal(rub.scene.u))
-    assert close(*ends, 1e-6)
+        ends.append(nodal_values(rub.scene.u))
+    assert is_close(*ends, 1e-6)
 
 
 @SERIAL
@@ -82,11 +84,11 @@ def test_multigrid_in_space():
         problem, contact, _, load = problems.problem(
             body, 1, 1e3, condensation=False, linear_solver="multigrid", **options
         )
-        load.value = body.end
+        load.value = body.final_load
         step = problem.solve()
         ends.append((step.method, contact.resultants().normal_force))
     assert [method for method, _ in ends] == ["lbfgs", "newton", "continuation"]
-    assert close(ends[0][1], ends[1][1], 1e-8) and close(ends[2][1], ends[1][1], 1e-8)
+    assert is_close(ends[0][1], ends[1][1], 1e-8) and is_close(ends[2][1], ends[1][1], 1e-8)
 
 
 @SERIAL
@@ -95,7 +97,7 @@ def test_multigrid_in_the_plane(k):
     """With multigrid Newton's method agrees with continuation, to 1e-6."""
     ends = []
     for method in ("newton", "continuation"):
-        rub = Rub(
+        rub = BlockOnBall(
             coulomb(k),
             mesh={"n": 16},
             condensation=False,
@@ -103,12 +105,12 @@ def test_multigrid_in_the_plane(k):
             method=method,
         )
         for side in (0.0, 0.005, 0.03, -0.03):
-            rub.move(side, 0.01)
+            rub.set_top_displacement(side, 0.01)
             step = rub.problem.solve()
             rub.problem.commit()
         assert step.method == method
-        ends.append(nodal(rub.scene.u))
-    assert close(*ends, 1e-6)
+        ends.append(nodal_values(rub.scene.u))
+    assert is_close(*ends, 1e-6)
 
 
 def test_sliding_between_two_bodies():
@@ -118,13 +120,13 @@ def test_sliding_between_two_bodies():
     """
     forces = []
     for method in ("newton", "alternating"):
-        slider = two_blocks.Slider("triangle", coulomb(300.0), start=1.0, method=method)
+        slider = two_blocks.SlidingBlock("triangle", coulomb(300.0), start=1.0, method=method)
         steps = [slider.step(0.01, along) for along in (0.0, 0.002, 0.1)]
         assert all(step.method == method for step in steps)
         found = [step.contacts["contact"] for step in steps]
         forces.append([value for r in found for value in (r.normal_force, r.tangential_force)])
         assert found[-1].stick == 0
-    assert close(*forces, 1e-7)
+    assert is_close(*forces, 1e-7)
 
 
 def test_multipliers_with_stiff_springs():
@@ -136,21 +138,25 @@ def test_multipliers_with_stiff_springs():
     found = []
     for k in (10.0, 300.0):
         augmented = {"enforcement": "augmented", "tolerance": 1e-7}
-        rub = Rub(coulomb(k), contact=augmented, method="newton")
-        rub.move(0.06, 0.03)
+        rub = BlockOnBall(coulomb(k), contact=augmented, method="newton")
+        rub.set_top_displacement(0.06, 0.03)
         found.append(rub.problem.solve().contacts["contact"])
-    assert close(found[0].normal_force, found[1].normal_force, 1e-4)
-    assert close(found[0].tangential_force, found[1].tangential_force, 1e-4)
+    assert is_close(found[0].normal_force, found[1].normal_force, 1e-4)
+    assert is_close(found[0].tangential_force, found[1].tangential_force, 1e-4)
 
 
 def test_iterations_are_independent_of_units():
     """The iterations of all attempts are the same in N-mm and in SI units."""
     made = []
     for length, pressure in ((1.0, 1.0), (1e-3, 1e6)):
-        rub = Rub(coulomb(1e3), mesh={"n": 8}, length=length, pressure=pressure, method="newton")
-        rub.move(0.01 * length, 0.03 * length)
+        rub = BlockOnBall(
+            coulomb(1e3), mesh={"n": 8}, length=length, pressure=pressure, method="newton"
+        )
+        rub.set_top_displacement(0.01 * length, 0.03 * length)
         made.append(rub.problem.solve().attempts)
-    assert same_effort(*([attempt.iterations for attempt in attempts] for attempts in made))
+    assert have_similar_iterations(
+        *([attempt.iterations for attempt in attempts] for attempts in made)
+    )
 
 
 @pytest.mark.parametrize(
@@ -164,11 +170,13 @@ def test_primal_dual_method_from_zero_initial_guess(cell, k):
     """
     forces = []
     for stiffness, method in ((1e3, "alternating"), (k, "primal_dual")):
-        _, problem, _ = pressed(cell, coulomb(stiffness), method, n=3, side=0.06, fallback=False)
+        _, problem, _ = loaded_block(
+            cell, coulomb(stiffness), method, n=3, side=0.06, fallback=False
+        )
         step = problem.solve()
         assert [attempt.method for attempt in step.attempts] == [method]
         forces.append(step.contacts["contact"].normal_force)
-    assert close(forces[1], forces[0], 2e-2)
+    assert is_close(forces[1], forces[0], 2e-2)
     assert step.iterations <= 10  # measured: 3 at every stiffness in the plane, 8 in space
 
 
@@ -178,7 +186,7 @@ def test_primal_dual_method_from_zero_initial_guess(cell, k):
 def test_primal_dual_method_refuses_unsupported_problems(case):
     """Problems that the primal-dual method cannot solve are refused when they are created."""
     scene = block("triangle", n=2)
-    law, obstacle, form = coulomb(10.0), cushion(2), scene.F
+    law, obstacle, form = coulomb(10.0), supporting_ball(2), scene.F
     if case == "no friction":
         law = fc.Frictionless()
     elif case == "a nonlinear bulk":
@@ -186,6 +194,6 @@ def test_primal_dual_method_refuses_unsupported_problems(case):
     else:
         obstacle = fc.HalfSpace((0, 0), (0, 1), displacement=fc.Motion(force=(None, 1.0)))
     contact = scene.contact(law, obstacle=obstacle)
-    bcs = [scene.hold(TOP, i) for i in range(2)]
+    bcs = [scene.dirichlet_bc(TOP, i) for i in range(2)]
     with pytest.raises(ValueError, match="method is 'primal_dual', which needs friction with"):
         fc.ContactProblem(form, scene.u, bcs=bcs, contacts=[contact], method="primal_dual")

@@ -22,15 +22,15 @@ from scenes.blocks import (
     TOP,
     block_mesh,
     dimension,
-    layers,
+    layer_partitioner,
 )
-from scenes.comparing import (
-    assemble_number,
-    close,
-    compiled,
-    gathered,
-    raised_everywhere,
-    sorted_by_place,
+from scenes.comparison import (
+    assemble_scalar,
+    assert_raised_on_all_ranks,
+    compile_with_maps,
+    gather,
+    is_close,
+    sort_by_coordinates,
 )
 from scenes.elasticity import displacement_space
 
@@ -102,11 +102,11 @@ def test_points_and_weights_are_those_of_gauss(cell, degree, ghost_mode):
     rule = facet_rule(cell, 2 * degree)
     x, w = expected_points(mesh, surface.facets, rule)
     assert COMM.allreduce(contact.quadrature.n_points) == COMM.allreduce(len(w))
-    actual = sorted_by_place(
-        gathered(COMM, contact.points), gathered(COMM, contact.quadrature.weights)
+    actual = sort_by_coordinates(
+        gather(COMM, contact.points), gather(COMM, contact.quadrature.weights)
     )
-    expected = sorted_by_place(gathered(COMM, x), gathered(COMM, w))
-    assert close(actual, expected, 1e-12, scale=1.0)
+    expected = sort_by_coordinates(gather(COMM, x), gather(COMM, w))
+    assert is_close(actual, expected, 1e-12, scale=1.0)
 
 
 @pytest.mark.parametrize("cell", CELLS)
@@ -122,9 +122,9 @@ def test_facets_are_those_with_the_tags(cell):
         assert all(COMM.allgather(bool(np.all(surface.facets < n_owned))))
         assert COMM.allreduce(surface.facets.size) == per_side * len(tags_wanted)
         one = fem.Constant(mesh, 1.0)
-        area = assemble_number(compiled(one * surface.measure(2)), COMM)
+        area = assemble_scalar(compile_with_maps(one * surface.measure(2)), COMM)
         assert abs(area - len(tags_wanted)) <= 1e-13 * len(tags_wanted)
-        weights = gathered(COMM, surface.quadrature(1).weights)
+        weights = gather(COMM, surface.quadrature(1).weights)
         # The weights sum to the area: 1e-13 is the round-off of a sum of 50 terms.
         assert abs(weights.sum() - len(tags_wanted)) <= 1e-13 * len(tags_wanted)
 
@@ -166,9 +166,9 @@ def test_vertex_scheme_has_its_points_at_the_vertices(cell):
     contact = contact_on(surface, 1)
     d = dimension(cell)
     vertices = facet_vertices(mesh, surface.facets).reshape(-1, d)
-    actual = sorted_by_place(gathered(COMM, contact.points))
-    assert close(actual, sorted_by_place(gathered(COMM, vertices)), 1e-12, scale=1.0)
-    weights = gathered(COMM, contact.quadrature.weights)
+    actual = sort_by_coordinates(gather(COMM, contact.points))
+    assert is_close(actual, sort_by_coordinates(gather(COMM, vertices)), 1e-12, scale=1.0)
+    weights = gather(COMM, contact.quadrature.weights)
     assert abs(weights.sum() - 1.0) <= 1e-12
     assert weights.min() > 0
 
@@ -178,7 +178,7 @@ def test_ranks_without_contact_facets(cell):
     """If Γc is on one rank only, the others have no points, and all ranks the same results."""
     d = dimension(cell)
     counts = (1, 6) if d == 2 else (1, 1, 6)
-    mesh, tags = block_mesh(cell, n=counts, partitioner=layers(cell))
+    mesh, tags = block_mesh(cell, n=counts, partitioner=layer_partitioner(cell))
     surface = fc.ContactSurface(mesh, tags, BOTTOM)
     contact = contact_on(surface, 1)
     holders = COMM.allgather(contact.quadrature.n_points)
@@ -192,7 +192,7 @@ def test_ranks_without_contact_facets(cell):
         assert abs(r.area - 1.0) <= 1e-14
         assert r.max_penetration == pytest.approx(0.25, rel=1e-14)
     contact.commit()
-    form = compiled(contact.form(ufl.TestFunction(contact.u.function_space)), contact)
+    form = compile_with_maps(contact.form(ufl.TestFunction(contact.u.function_space)), contact)
     vector = fem.Function(contact.u.function_space)
     fem.assemble_vector(vector.x.array, form)
     # The residual is minus the force on the body.
@@ -217,18 +217,18 @@ def test_curved_geometry(cell):
     mesh, tags = block_mesh(cell, bend=bend)
     surface = fc.ContactSurface(mesh, tags, BOTTOM, quadrature_degree=12)
     contact = contact_on(surface, 2)
-    x = gathered(COMM, contact.points)
-    assert close(x[:, -1], c * x[:, 0] ** 2, 1e-12, scale=1.0)
+    x = gather(COMM, contact.points)
+    assert is_close(x[:, -1], c * x[:, 0] ** 2, 1e-12, scale=1.0)
     assert 0 < x[:, 0].min() < 0.1 and 0.9 < x[:, 0].max() < 1
     slope = 2 * c
     arc = (np.sqrt(1 + slope**2) + np.arcsinh(slope) / slope) / 2
     area = COMM.allreduce(float(contact.quadrature.weights.sum()))
     assert abs(area - arc) <= 1e-6
     # The gap above the floor y = 0 is the height, and a displacement is evaluated at the points.
-    assert close(gathered(COMM, contact.gap), x[:, -1], 1e-12, scale=1.0)
+    assert is_close(gather(COMM, contact.gap), x[:, -1], 1e-12, scale=1.0)
     contact.u.interpolate(lambda x: np.vstack([0.1 * x[0]] * d))
     contact.evaluate()
-    assert close(gathered(COMM, contact.gap), x[:, -1] + 0.1 * x[:, 0], 1e-12, scale=1.0)
+    assert is_close(gather(COMM, contact.gap), x[:, -1] + 0.1 * x[:, 0], 1e-12, scale=1.0)
 
 
 # ---- invalid input -------------------------------------------------------------------------------
@@ -237,14 +237,18 @@ def test_curved_geometry(cell):
 def test_unknown_tag_is_refused():
     """The message states the unknown tag and the existing ones."""
     mesh, tags = block_mesh("triangle")
-    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, 99), ValueError, "99", "[1, 2, 3, 4]")
-    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, [BOTTOM, 99]), ValueError, "99")
+    assert_raised_on_all_ranks(
+        lambda: fc.ContactSurface(mesh, tags, 99), ValueError, "99", "[1, 2, 3, 4]"
+    )
+    assert_raised_on_all_ranks(
+        lambda: fc.ContactSurface(mesh, tags, [BOTTOM, 99]), ValueError, "99"
+    )
 
 
 def test_empty_list_of_tags_is_refused():
     """An empty list of tags gives an empty Γc, which is an error."""
     mesh, tags = block_mesh("triangle")
-    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, []), ValueError, "empty")
+    assert_raised_on_all_ranks(lambda: fc.ContactSurface(mesh, tags, []), ValueError, "empty")
 
 
 @pytest.mark.parametrize("ghost_mode", [GhostMode.none, GhostMode.shared_facet])
@@ -256,7 +260,9 @@ def test_interior_facets_are_refused(cell, ghost_mode):
     facets = dolfinx.mesh.locate_entities(mesh, d - 1, lambda x: np.isclose(x[d - 1], 0.5))
     values = np.full(facets.size, 7, dtype=np.int32)
     tags = dolfinx.mesh.meshtags(mesh, d - 1, np.sort(facets), values)
-    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, 7), ValueError, "interior facets", "7")
+    assert_raised_on_all_ranks(
+        lambda: fc.ContactSurface(mesh, tags, 7), ValueError, "interior facets", "7"
+    )
 
 
 def test_one_interior_facet_on_one_rank_only():
@@ -269,7 +275,9 @@ def test_one_interior_facet_on_one_rank_only():
     facets = np.concatenate([tags.find(BOTTOM), inside]).astype(np.int32)
     assert COMM.allreduce(inside.size) == 1
     tags = dolfinx.mesh.meshtags(mesh, 1, np.sort(facets), np.full(facets.size, 7, dtype=np.int32))
-    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, 7), ValueError, "interior facets")
+    assert_raised_on_all_ranks(
+        lambda: fc.ContactSurface(mesh, tags, 7), ValueError, "interior facets"
+    )
 
 
 def test_wrong_surface_arguments():
@@ -279,11 +287,11 @@ def test_wrong_surface_arguments():
     cells = np.arange(n_cells, dtype=np.int32)
     cell_tags = dolfinx.mesh.meshtags(mesh, 2, cells, np.full(n_cells, BOTTOM, dtype=np.int32))
     surface = fc.ContactSurface
-    raised_everywhere(lambda: surface(mesh, cell_tags, BOTTOM), ValueError, "facet_tags")
-    raised_everywhere(
+    assert_raised_on_all_ranks(lambda: surface(mesh, cell_tags, BOTTOM), ValueError, "facet_tags")
+    assert_raised_on_all_ranks(
         lambda: surface(mesh, tags, BOTTOM, quadrature_scheme="lobatto"), ValueError, "lobatto"
     )
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: surface(mesh, tags, BOTTOM, quadrature_degree=0), ValueError, "quadrature_degree"
     )
 
@@ -297,7 +305,9 @@ def test_surface_mesh_in_3d_is_refused():
     shell.topology.create_entities(1)
     edges = np.arange(shell.topology.index_map(1).size_local, dtype=np.int32)
     tags = dolfinx.mesh.meshtags(shell, 1, edges, np.full(edges.size, BOTTOM, dtype=np.int32))
-    raised_everywhere(lambda: fc.ContactSurface(shell, tags, BOTTOM), ValueError, "dimension")
+    assert_raised_on_all_ranks(
+        lambda: fc.ContactSurface(shell, tags, BOTTOM), ValueError, "dimension"
+    )
 
 
 def test_prisms_are_refused_by_name():
@@ -306,8 +316,10 @@ def test_prisms_are_refused_by_name():
     mesh = dolfinx.mesh.create_box(COMM, unit, (1, 1, 1), dolfinx.mesh.CellType.prism)
     none = np.zeros(0, dtype=np.int32)
     tags = dolfinx.mesh.meshtags(mesh, 2, none, none)
-    raised_everywhere(lambda: fc.ContactSurface(mesh, tags, 1), ValueError, "prism", "hexahedron")
-    raised_everywhere(lambda: fc.join_meshes([mesh]), ValueError, "prism", "hexahedron")
+    assert_raised_on_all_ranks(
+        lambda: fc.ContactSurface(mesh, tags, 1), ValueError, "prism", "hexahedron"
+    )
+    assert_raised_on_all_ranks(lambda: fc.join_meshes([mesh]), ValueError, "prism", "hexahedron")
 
 
 @pytest.mark.parametrize(("cell", "degree"), GRID)

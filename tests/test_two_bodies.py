@@ -16,10 +16,10 @@ import fenics_contact as fc
 from benchmarks.methods import dragged_block
 from scenes.blocks import CELLS
 from scenes.bodies import Bodies, boxes
-from scenes.comparing import raised_everywhere
-from scenes.elasticity import hold, residual
-from scenes.tags import between, near
-from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, E, pressed, two_blocks
+from scenes.comparison import assert_raised_on_all_ranks
+from scenes.elasticity import dirichlet_bc, residual
+from scenes.tags import at_coordinate, at_interface
+from scenes.two_blocks import BOTTOM, LOWER_FACE, TOP, UPPER_FACE, E, pressed_blocks, two_blocks
 
 COMM = MPI.COMM_WORLD
 
@@ -40,7 +40,7 @@ def test_patch(cell: str, degree: int, nu: float) -> None:
     of the solver.
     """
     k_n = 1e7
-    problem, contact, _ = pressed(cell, degree, nu, fc.Coulomb(0.3, k_n=k_n, k_t=1e6))
+    problem, contact, _ = pressed_blocks(cell, degree, nu, fc.Coulomb(0.3, k_n=k_n, k_t=1e6))
     problem.solve()
     confined = E * (1 - nu) / (1 + nu) / (1 - 2 * nu)
     p = 0.01 / (1 / confined + 1 / k_n)
@@ -52,19 +52,21 @@ def test_patch(cell: str, degree: int, nu: float) -> None:
 
 def test_exact_contact_pressure() -> None:
     """For E = 1e6, ν = 0, free sides and a compression of 0.01, p tends to 1e4 as k_n grows."""
-    problem, contact, _ = pressed(
-        "quadrilateral", 1, 0.0, fc.Frictionless(k_n=1e12), confined=False, method="newton"
+    problem, contact, _ = pressed_blocks(
+        "quadrilateral", 1, 0.0, fc.Frictionless(k_n=1e12), laterally_fixed=False, method="newton"
     )
     problem.solve()
     # The gap p/k_n = 1e-8, 1e-6 of the compression, reduces the pressure by 1e-6.
     assert contact.gather()["pressure"] == pytest.approx(1e4, rel=2e-6)
 
 
-@pytest.mark.parametrize("surface", [LOWER, UPPER])
+@pytest.mark.parametrize("surface", [LOWER_FACE, UPPER_FACE])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_contact_forces_and_moments_sum_to_zero(cell: str, surface: int) -> None:
     """Contact forces of an oscillating u sum to zero, as do moments at zero gap, to 1e-12."""
-    problem, contact, _ = pressed(cell, 1, 0.3, fc.Coulomb(0.3, k_n=1e6, k_t=1e6), surface=surface)
+    problem, contact, _ = pressed_blocks(
+        cell, 1, 0.3, fc.Coulomb(0.3, k_n=1e6, k_t=1e6), surface=surface
+    )
     u, d = problem.u, len(problem.u)
     u.interpolate(
         lambda x: np.vstack(
@@ -88,7 +90,7 @@ def test_contact_forces_and_moments_sum_to_zero(cell: str, surface: int) -> None
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_tangent_is_the_derivative_of_the_force(cell: str) -> None:
     """The tangent agrees with central differences to 1e-6 if all points are closed and slip."""
-    problem, contact, _ = pressed(cell, 1, 0.3, fc.Coulomb(0.1, k_n=1e6, k_t=1e6))
+    problem, contact, _ = pressed_blocks(cell, 1, 0.3, fc.Coulomb(0.1, k_n=1e6, k_t=1e6))
     u, d = problem.u, len(problem.u)
     # Moving the lower block up and sideways closes all points and makes them slip.
     mesh = u.function_space.mesh
@@ -125,8 +127,8 @@ def test_points_beyond_the_opposing_body_are_open() -> None:
     mesh, tags = two_blocks("quadrilateral", (8, 3), widths=(2.0, 1.0))
     V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
     u = fem.Function(V)
-    surface = fc.ContactSurface(mesh, tags, LOWER)
-    contact = fc.Contact(u, surface, fc.DeformableBody(tags, UPPER), fc.Frictionless(k_n=1e6))
+    surface = fc.ContactSurface(mesh, tags, LOWER_FACE)
+    contact = fc.Contact(u, surface, fc.DeformableBody(tags, UPPER_FACE), fc.Frictionless(k_n=1e6))
     # Of eight facets of 1/4 with two points each, four are beyond the block of width 1.
     assert contact.n_unpaired == 8
     x = contact.gather()["x"][:, 0]
@@ -150,7 +152,7 @@ def test_search_distance_limits_pairs() -> None:
 
 def test_boundary_form_with_opposing_body_raises() -> None:
     """The boundary form has no dofs of the opposing body, so `Contact.form` raises."""
-    problem, contact, _ = pressed("triangle", 1, 0.0, fc.Frictionless(k_n=1e6))
+    problem, contact, _ = pressed_blocks("triangle", 1, 0.0, fc.Frictionless(k_n=1e6))
     with pytest.raises(ValueError, match="opposing body"):
         contact.form(ufl.TestFunction(problem.u.function_space))
 
@@ -237,12 +239,12 @@ def test_coarse_slave_surface_on_fine_master_surface(kinematics, fine) -> None:
     penetrates between them and the force is 40 to 50 % less.
     """
     forces = []
-    for own, other in ((LOWER, UPPER), (UPPER, LOWER)):
+    for own, other in ((LOWER_FACE, UPPER_FACE), (UPPER_FACE, LOWER_FACE)):
         mesh, tags = two_blocks("quadrilateral", (4, fine), (4.0, 1.0), 1.5)
         u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (2,))))
         down, side = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
-        bcs = [hold(u, tags, BOTTOM, i) for i in range(2)]
-        bcs += [hold(u, tags, TOP, i, value) for i, value in enumerate((side, down))]
+        bcs = [dirichlet_bc(u, tags, BOTTOM, i) for i in range(2)]
+        bcs += [dirichlet_bc(u, tags, TOP, i, value) for i, value in enumerate((side, down))]
         law = fc.Coulomb(0.3, k_n=10 * E, k_t=10 * E)
         surface, obstacle = fc.ContactSurface(mesh, tags, own), fc.DeformableBody(tags, other)
         contact = fc.Contact(u, surface, obstacle, law, kinematics=kinematics)
@@ -271,16 +273,16 @@ def _on_a_graded_plate(own, wide, *, space=False, kinematics="finite"):
     ]
     d = len(axes[0])
     sides = {
-        BOTTOM: near(d - 1, 0.0),
-        TOP: near(d - 1, 1.5),
-        LOWER: between(d - 1, 1.0, above=False),
-        UPPER: between(d - 1, 1.0, above=True),
+        BOTTOM: at_coordinate(d - 1, 0.0),
+        TOP: at_coordinate(d - 1, 1.5),
+        LOWER_FACE: at_interface(d - 1, 1.0, above=False),
+        UPPER_FACE: at_interface(d - 1, 1.0, above=True),
     }
     body = Bodies(boxes(axes, sides), E, 0.3)
-    body.hold(BOTTOM, *range(d))
-    body.hold(TOP, *range(d - 1))
-    body.hold(TOP, d - 1, value=-0.02)
-    other = {LOWER: UPPER, UPPER: LOWER}[own]
+    body.prescribe(BOTTOM, *range(d))
+    body.prescribe(TOP, *range(d - 1))
+    body.prescribe(TOP, d - 1, value=-0.02)
+    other = {LOWER_FACE: UPPER_FACE, UPPER_FACE: LOWER_FACE}[own]
     law = fc.Frictionless(k_n=100 * E)
     contact = body.contact(own, other, law, kinematics=kinematics)
     with warnings.catch_warnings(record=True) as caught:
@@ -297,7 +299,7 @@ def test_small_block_on_fine_end_of_graded_plate(kinematics) -> None:
     length, 2 and 17 % of it were missing.
     """
     forces = []
-    for own in (UPPER, LOWER):
+    for own in (UPPER_FACE, LOWER_FACE):
         problem, contact, _ = _on_a_graded_plate(own, wide=False, kinematics=kinematics)
         problem.solve()
         forces.append(contact.resultants().normal_force)
@@ -306,7 +308,7 @@ def test_small_block_on_fine_end_of_graded_plate(kinematics) -> None:
 
 def test_warning_for_fine_end_under_long_surface_in_3d() -> None:
     """A twelfth of Γc is on facets 6 times shorter in their longest sides, 8 times in one side."""
-    for own, expected in ((UPPER, ["6 times"]), (LOWER, [])):
+    for own, expected in ((UPPER_FACE, ["6 times"]), (LOWER_FACE, [])):
         _, contact, texts = _on_a_graded_plate(own, wide=True, space=True)
         assert contact.quadrature.degree == (6 if expected else 2)
         assert len(texts) == len(expected)
@@ -322,22 +324,22 @@ def test_sliding_onto_finer_facets_fails_without_enough_points() -> None:
         x = np.r_[np.linspace(0.0, 0.5, 21), np.arange(1.0, 20.1, 0.5)]
         axes = [[x, np.linspace(0.0, 1.0, 9)], [np.array([2.0, 2.5]), np.linspace(1.0, 1.5, 5)]]
         sides = {
-            BOTTOM: near(1, 0.0),
-            TOP: near(1, 1.5),
-            LOWER: between(1, 1.0, above=False),
-            UPPER: between(1, 1.0, above=True),
+            BOTTOM: at_coordinate(1, 0.0),
+            TOP: at_coordinate(1, 1.5),
+            LOWER_FACE: at_interface(1, 1.0, above=False),
+            UPPER_FACE: at_interface(1, 1.0, above=True),
         }
         body = Bodies(boxes(axes, sides), E, 0.3)
         side = body.constant()
-        body.hold(BOTTOM, 0, 1)
-        body.hold(TOP, 0, value=side)
-        body.hold(TOP, 1, value=-0.02)
+        body.prescribe(BOTTOM, 0, 1)
+        body.prescribe(TOP, 0, value=side)
+        body.prescribe(TOP, 1, value=-0.02)
         law = fc.Frictionless(k_n=100 * E)
-        contact = body.contact(UPPER, LOWER, law, quadrature=given, kinematics="finite")
+        contact = body.contact(UPPER_FACE, LOWER_FACE, law, quadrature=given, kinematics="finite")
         problem = body.problem(contact)
         for side.value in (0.0, -1.0, -2.0):
             if given is None and side.value == -2.0:
-                raised_everywhere(problem.solve, fc.NotConverged, "penetrates")
+                assert_raised_on_all_ranks(problem.solve, fc.NotConverged, "penetrates")
             else:
                 problem.solve()
                 problem.commit()
@@ -350,23 +352,31 @@ def test_quadrature_degree_follows_opposing_facets(cell) -> None:
     d, law = mesh.geometry.dim, fc.Frictionless(k_n=E)
     u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (d,))))
     degrees = []
-    for own, other, given in ((LOWER, UPPER, None), (UPPER, LOWER, None), (LOWER, UPPER, 3)):
+    for own, other, given in (
+        (LOWER_FACE, UPPER_FACE, None),
+        (UPPER_FACE, LOWER_FACE, None),
+        (LOWER_FACE, UPPER_FACE, 3),
+    ):
         surface = fc.ContactSurface(mesh, tags, own, quadrature_degree=given)
         contact = fc.Contact(u, surface, fc.DeformableBody(tags, other), law)
         degrees.append(contact.quadrature.degree)
     assert degrees == [{2: 38, 3: 6}[d], 2, 3]  # 2n - 2: n points a side; limit 6 in 3D
 
 
-def _pressed_by(cell, times, *, degree=1, own=LOWER, kinematics="finite", given=None, **options):
+def _pressed_by(
+    cell, times, *, degree=1, own=LOWER_FACE, kinematics="finite", given=None, **options
+):
     """A block of ``times`` cells per side, moved down by a tenth of its height onto one cell."""
     mesh, tags = two_blocks(cell, (1, times))
     d = mesh.geometry.dim
     u = fem.Function(fem.functionspace(mesh, ("Lagrange", degree, (d,))))
     down = fem.Constant(mesh, -0.05)
-    bcs = [hold(u, tags, tag, i) for tag in (BOTTOM, TOP) for i in range(d - 1)]
-    bcs += [hold(u, tags, BOTTOM, d - 1), hold(u, tags, TOP, d - 1, down)]
+    bcs = [dirichlet_bc(u, tags, tag, i) for tag in (BOTTOM, TOP) for i in range(d - 1)]
+    bcs += [dirichlet_bc(u, tags, BOTTOM, d - 1), dirichlet_bc(u, tags, TOP, d - 1, down)]
     surface = fc.ContactSurface(mesh, tags, own, quadrature_degree=given)
-    obstacle = fc.DeformableBody(tags, {LOWER: UPPER, UPPER: LOWER}.get(own, own))
+    obstacle = fc.DeformableBody(
+        tags, {LOWER_FACE: UPPER_FACE, UPPER_FACE: LOWER_FACE}.get(own, own)
+    )
     law = fc.Frictionless(k_n=10 * E)
     contact = fc.Contact(u, surface, obstacle, law, kinematics=kinematics)
     with warnings.catch_warnings(record=True) as caught:
@@ -394,13 +404,13 @@ def test_warning_if_quadrature_is_too_coarse(cell, degree, times, caplog) -> Non
     told = [r.getMessage() for r in caplog.records if r.name == "fenics_contact"]
     assert told.count(texts[0]) == (COMM.rank == 0)
     if degree == 1:
-        raised_everywhere(problem.solve, fc.NotConverged, "has crossed")
+        assert_raised_on_all_ranks(problem.solve, fc.NotConverged, "has crossed")
         coarse = 0.0
     else:
         problem.solve()
         coarse = contact.resultants().normal_force
     forces = []
-    for options in ({"own": UPPER}, {"given": wanted}):
+    for options in ({"own": UPPER_FACE}, {"given": wanted}):
         problem, contact, texts = _pressed_by(cell, times, degree=degree, **options)
         assert not texts
         problem.solve()
@@ -419,13 +429,17 @@ def test_warning_if_opposing_surface_ends_within_facets(cell, n, width) -> None:
     with enough points it differs by 1 % (asserted: 2 %), since Γc is the other surface.
     """
     forces, told = [], []
-    for own, other, degree in ((LOWER, UPPER, None), (LOWER, UPPER, 30), (UPPER, LOWER, None)):
+    for own, other, degree in (
+        (LOWER_FACE, UPPER_FACE, None),
+        (LOWER_FACE, UPPER_FACE, 30),
+        (UPPER_FACE, LOWER_FACE, None),
+    ):
         mesh, tags = two_blocks(cell, (n, round(n * width)), widths=(1.0, width), shift=0.31)
         d = mesh.geometry.dim
         u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (d,))))
-        bcs = [hold(u, tags, tag, i) for tag in (BOTTOM, TOP) for i in range(d - 1)]
+        bcs = [dirichlet_bc(u, tags, tag, i) for tag in (BOTTOM, TOP) for i in range(d - 1)]
         down = fem.Constant(mesh, -0.02)
-        bcs += [hold(u, tags, BOTTOM, d - 1), hold(u, tags, TOP, d - 1, down)]
+        bcs += [dirichlet_bc(u, tags, BOTTOM, d - 1), dirichlet_bc(u, tags, TOP, d - 1, down)]
         surface = fc.ContactSurface(mesh, tags, own, quadrature_degree=degree)
         obstacle, law = fc.DeformableBody(tags, other), fc.Frictionless(k_n=10 * E)
         contact = fc.Contact(u, surface, obstacle, law, kinematics="finite")
@@ -469,20 +483,20 @@ def test_narrow_facets_are_counted_along_both_sides(here, there, told) -> None:
             boxes(
                 axes,
                 {
-                    BOTTOM: near(2, 0.0),
-                    TOP: near(2, 2.0),
-                    LOWER: between(2, 1.0, above=False),
-                    UPPER: between(2, 1.0, above=True),
+                    BOTTOM: at_coordinate(2, 0.0),
+                    TOP: at_coordinate(2, 2.0),
+                    LOWER_FACE: at_interface(2, 1.0, above=False),
+                    UPPER_FACE: at_interface(2, 1.0, above=True),
                 },
             ),
             E,
             0.3,
         )
-        body.hold(BOTTOM, 0, 1, 2)
-        body.hold(TOP, 0, 1)
-        body.hold(TOP, 2, value=-0.01)
+        body.prescribe(BOTTOM, 0, 1, 2)
+        body.prescribe(TOP, 0, 1)
+        body.prescribe(TOP, 2, value=-0.01)
         law = fc.Frictionless(k_n=10 * E)
-        contact = body.contact(LOWER, UPPER, law, quadrature=given, kinematics="finite")
+        contact = body.contact(LOWER_FACE, UPPER_FACE, law, quadrature=given, kinematics="finite")
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             problem = body.problem(contact)
@@ -537,7 +551,7 @@ def test_no_warning_if_quadrature_error_is_small() -> None:
         ("hexahedron", 2, {"degree": 2}),
         ("hexahedron", 8, {"kinematics": "small"}),
         ("hexahedron", 8, {"given": 2}),
-        ("hexahedron", 8, {"own": (LOWER, UPPER)}),
+        ("hexahedron", 8, {"own": (LOWER_FACE, UPPER_FACE)}),
         ("quadrilateral", 80, {}),
         ("triangle", 40, {"degree": 2}),
     ):
@@ -558,10 +572,10 @@ def test_relative_stiffness_uses_the_softer_body(cell, contrast, swap) -> None:
     modulus = fem.Function(fem.functionspace(mesh, ("DG", 0)))
     modulus.interpolate(lambda x: np.where(x[d - 1] > 0.5, E, contrast * E))
     v = ufl.TestFunction(u.function_space)
-    own, other = (LOWER, UPPER) if swap else (UPPER, LOWER)
+    own, other = (LOWER_FACE, UPPER_FACE) if swap else (UPPER_FACE, LOWER_FACE)
     law = fc.Frictionless(k_n=fc.RelativeStiffness(3.0))
     contact = fc.Contact(u, fc.ContactSurface(mesh, tags, own), fc.DeformableBody(tags, other), law)
-    bcs = [hold(u, tags, tag, i) for tag in (BOTTOM, TOP) for i in range(d)]
+    bcs = [dirichlet_bc(u, tags, tag, i) for tag in (BOTTOM, TOP) for i in range(d)]
     fc.ContactProblem(residual(u, v, modulus, 0.3), u, bcs=bcs, contacts=[contact])
     contact.evaluate()
     stiffness = contact.values.normal_stiffness
@@ -576,15 +590,15 @@ def test_unconstrained_body_is_named() -> None:
     u, v = fem.Function(V), ufl.TestFunction(V)
     zero = fem.Constant(mesh, np.zeros(2))
     clamp = fem.dirichletbc(zero, fem.locate_dofs_topological(V, 1, tags.find(BOTTOM)), V)
-    surface = fc.ContactSurface(mesh, tags, UPPER)
-    contact = fc.Contact(u, surface, fc.DeformableBody(tags, LOWER), fc.Frictionless(k_n=1e6))
+    surface = fc.ContactSurface(mesh, tags, UPPER_FACE)
+    contact = fc.Contact(u, surface, fc.DeformableBody(tags, LOWER_FACE), fc.Frictionless(k_n=1e6))
     with pytest.raises(ValueError, match="translation along x of body"):
         fc.ContactProblem(residual(u, v, E, 0.0), u, bcs=[clamp], contacts=[contact])
 
 
 def test_jump_of_a_rigid_body_motion_is_zero() -> None:
     """The jump of one rigid-body motion of both bodies is zero at every point, to 1e-12."""
-    _, contact, _ = pressed("tetrahedron", 1, 0.3, fc.Frictionless(k_n=1e6), n=(3, 5))
+    _, contact, _ = pressed_blocks("tetrahedron", 1, 0.3, fc.Frictionless(k_n=1e6), n=(3, 5))
     space = contact.u.function_space
     motion = fem.Function(space)
     motion.interpolate(lambda x: np.vstack([1 - 2 * x[1] + x[2], 2 * x[0], 3 - x[0]]))

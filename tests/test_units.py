@@ -9,10 +9,10 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from scenes.blocks import layers
-from scenes.comparing import at_points, close, nodal, same_effort
-from scenes.rubbing import PATH, Rub, walk
-from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, two_blocks
+from scenes.block_on_ball import PATH, BlockOnBall, solve_path
+from scenes.blocks import layer_partitioner
+from scenes.comparison import have_similar_iterations, is_close, nodal_values, point_values
+from scenes.two_blocks import BOTTOM, LOWER_FACE, TOP, UPPER_FACE, two_blocks
 
 COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(300)]
@@ -27,9 +27,9 @@ CONDENSATION = [None, False]
 def same(results) -> None:
     """Check that iterations differ by at most one per increment, and fields by 1e-9 (round-off)."""
     for iterations, *fields in results[1:]:
-        assert same_effort(iterations, results[0][0])
+        assert have_similar_iterations(iterations, results[0][0])
         for field, first in zip(fields, results[0][1:], strict=True):
-            assert close(field, first, 1e-9)
+            assert is_close(field, first, 1e-9)
 
 
 @pytest.mark.each
@@ -42,20 +42,26 @@ def test_load_reversal_is_independent_of_units(cell, degree, n, method, condensa
     """A block is pressed on a ball, dragged in both directions, and lifted."""
     results = []
     for length, pressure in UNITS:
-        made = Rub(
+        made = BlockOnBall(
             fc.Coulomb(0.3),
             cell=cell,
             degree=degree,
             # Own partitioner: the default one may partition equal meshes differently.
-            mesh={"n": n[::-1], "size": length * np.ones(2), "partitioner": layers(cell)},
+            mesh={
+                "n": n[::-1],
+                "size": length * np.ones(2),
+                "partitioner": layer_partitioner(cell),
+            },
             length=length,
             pressure=pressure,
             method=method,
             condensation=condensation,
         )
-        steps = walk(made, length)
-        traction = at_points(made.contact, made.contact.traction) / pressure
-        results.append(([s.iterations for s in steps], nodal(made.scene.u) / length, traction))
+        steps = solve_path(made, length)
+        traction = point_values(made.contact, made.contact.traction) / pressure
+        results.append(
+            ([s.iterations for s in steps], nodal_values(made.scene.u) / length, traction)
+        )
     same(results)
 
 
@@ -75,7 +81,7 @@ def test_friction_in_3d_is_independent_of_units(law, method):
     """A block in 3D is pressed and dragged, with every friction law."""
     results = []
     for length, pressure in UNITS:
-        made = Rub(
+        made = BlockOnBall(
             {
                 "cone": fc.Coulomb(0.3),
                 "multipliers": fc.Coulomb(0.3),
@@ -84,15 +90,21 @@ def test_friction_in_3d_is_independent_of_units(law, method):
                 "Tresca": fc.Tresca(0.3, 20.0 * pressure),
             }[law],
             cell="hexahedron",
-            mesh={"n": 2, "size": length * np.ones(3), "partitioner": layers("hexahedron")},
+            mesh={
+                "n": 2,
+                "size": length * np.ones(3),
+                "partitioner": layer_partitioner("hexahedron"),
+            },
             contact={"enforcement": "augmented"} if law == "multipliers" else {},
             length=length,
             pressure=pressure,
             method=method,
         )
-        steps = walk(made, length, PATH[:5])
-        traction = at_points(made.contact, made.contact.traction) / pressure
-        results.append(([s.iterations for s in steps], nodal(made.scene.u) / length, traction))
+        steps = solve_path(made, length, PATH[:5])
+        traction = point_values(made.contact, made.contact.traction) / pressure
+        results.append(
+            ([s.iterations for s in steps], nodal_values(made.scene.u) / length, traction)
+        )
     same(results)
 
 
@@ -118,8 +130,8 @@ def test_two_bodies_are_independent_of_units(method, condensation):
         body = fc.elasticity.LinearElastic(u, 1000.0 * pressure, 0.3, "plane strain")
         contact = fc.Contact(
             u,
-            fc.ContactSurface(mesh, tags, UPPER),
-            fc.DeformableBody(tags, LOWER),
+            fc.ContactSurface(mesh, tags, UPPER_FACE),
+            fc.DeformableBody(tags, LOWER_FACE),
             fc.Coulomb(0.3),
         )
         problem = fc.ContactProblem(
@@ -135,6 +147,6 @@ def test_two_bodies_are_independent_of_units(method, condensation):
             move[0].value, move[1].value = side * length / 2, -down * length / 2
             iterations.append(problem.solve().iterations)
             problem.commit()
-        traction = at_points(contact, contact.traction) / pressure
-        results.append((iterations, nodal(u) / length, traction))
+        traction = point_values(contact, contact.traction) / pressure
+        results.append((iterations, nodal_values(u) / length, traction))
     same(results)

@@ -8,8 +8,8 @@ from petsc4py import PETSc
 import fenics_contact as fc
 from fenics_contact.checks.verdict import ForceBalance
 from fenics_contact.laws.return_maps import positive_part
-from scenes.comparing import identical
-from scenes.rubbing import PATH, Rub, snapshot, walk
+from scenes.block_on_ball import PATH, BlockOnBall, copy_state, solve_path
+from scenes.comparison import are_identical
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
@@ -48,8 +48,8 @@ class Changed(fc.Coulomb):
 
 def test_unchanged_law_passes():
     """The same law without a change passes: the failures below are due to the changes."""
-    made = Rub(Changed("nothing"), method="newton")
-    steps = walk(made, path=PATH[:3])
+    made = BlockOnBall(Changed("nothing"), method="newton")
+    steps = solve_path(made, path=PATH[:3])
     assert steps[-1].contacts["contact"].slip > 0
     assert not any(s.verdict.failures for s in steps)
 
@@ -60,21 +60,21 @@ def test_unchanged_law_passes():
 )
 def test_violated_law_is_detected(what):
     """Tractions that violate cone, complementarity or flow rule do not pass as a solution."""
-    made = Rub(Changed(what), method="newton")
-    before = snapshot(made)
+    made = BlockOnBall(Changed(what), method="newton")
+    before = copy_state(made)
     with pytest.raises(fc.NotConverged) as caught:
-        walk(made, path=[PATH[2]])
+        solve_path(made, path=[PATH[2]])
     failures = "; ".join(caught.value.verdict.failures)
     assert "contact:" in failures, failures
     assert failures in str(caught.value)
-    assert identical(snapshot(made), before)
+    assert are_identical(copy_state(made), before)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("factor", [0.9, 1.0 + 1e-4])
 def test_wrong_contact_residual_is_caught(method, factor, monkeypatch):
     """Forces do not balance if the contact residual is not the integral of the tractions."""
-    made = Rub(method=method)
+    made = BlockOnBall(method=method)
     right = fc.ContactOperator.add_force
 
     def wrong(self, residual, traction=None):
@@ -84,7 +84,7 @@ def test_wrong_contact_residual_is_caught(method, factor, monkeypatch):
         before.destroy()
 
     monkeypatch.setattr(fc.ContactOperator, "add_force", wrong)
-    made.move(*PATH[1])
+    made.set_top_displacement(*PATH[1])
     with pytest.raises(fc.NotConverged) as caught:
         made.problem.solve()
     assert any("balance" in f for f in caught.value.verdict.failures)
@@ -93,7 +93,7 @@ def test_wrong_contact_residual_is_caught(method, factor, monkeypatch):
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_forces_at_wrong_points_are_caught(cell, monkeypatch):
     """Moments do not balance if each force, of the right sum, acts at another point of Γc."""
-    made = Rub(cell=cell)
+    made = BlockOnBall(cell=cell)
     right, contact = fc.ContactOperator.add_force, made.contact
 
     def wrong(self, residual, traction=None):
@@ -102,7 +102,7 @@ def test_forces_at_wrong_points_are_caught(cell, monkeypatch):
         right(self, residual, np.roll(force, 1, axis=0) / contact.measure[:, None])
 
     monkeypatch.setattr(fc.ContactOperator, "add_force", wrong)
-    made.move(*PATH[1])
+    made.set_top_displacement(*PATH[1])
     with pytest.raises(fc.NotConverged) as caught:
         made.problem.solve()
     assert any("moments" in f for f in caught.value.verdict.failures)
@@ -116,11 +116,11 @@ def test_nodal_forces_agree_with_the_form(factor, condensation):
     The results of the solver, the laws and the sums of forces agree with it within their
     tolerances.
     """
-    made = Rub(cross_check=True, condensation=condensation)
+    made = BlockOnBall(cross_check=True, condensation=condensation)
     made.contact.pairs.own_map.scale(factor)
-    made.move(*PATH[1])
+    made.set_top_displacement(*PATH[1])
     if factor == 1.0:
-        steps = walk(made)
+        steps = solve_path(made)
         assert all(step.verdict.cross_check["contact"].holds() for step in steps)
         assert all(step.verdict.cross_check["contact"].force > 0 for step in steps)
         return
@@ -133,22 +133,22 @@ def test_nodal_forces_agree_with_the_form(factor, condensation):
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_premature_convergence_is_caught(method, monkeypatch):
     """Convergence claimed by SNES at its first check is refused; the state is as before."""
-    made = Rub(method=method, fallback=False)
-    walk(made, path=PATH[:1])
-    before = snapshot(made)
-    made.move(*PATH[2])
+    made = BlockOnBall(method=method, fallback=False)
+    solve_path(made, path=PATH[:1])
+    before = copy_state(made)
+    made.set_top_displacement(*PATH[2])
     claimed = PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
     monkeypatch.setattr(made.problem.solver.main, "converged", lambda: claimed)
     with pytest.raises(fc.NotConverged) as caught:
         made.problem.solve()
     assert any("residual" in f for f in caught.value.verdict.failures)
-    assert identical(snapshot(made), before)
+    assert are_identical(copy_state(made), before)
 
 
 def test_verdict_of_a_solution():
     """A step has its verdict: residual within tolerance, laws to 1e-10, balance of forces."""
-    made = Rub()
-    for step in walk(made):
+    made = BlockOnBall()
+    for step in solve_path(made):
         verdict = step.verdict
         assert not verdict.failures
         equation, resultant = verdict.worst_equation, verdict.worst_sum

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from scenes.processes import ROOT, command, environment
+from scenes.processes import ROOT, command, subprocess_environment
 from verification.cases import Case, Outcome, Row
 
 __all__ = ["DEMOS"]
@@ -25,7 +25,7 @@ def run(name: str, *options: str) -> dict[str, Any]:
     """
     with tempfile.TemporaryDirectory() as folder:
         words = command(1, ROOT / "demos" / f"{name}.py", *options, "--output", folder)
-        done = subprocess.run(words, capture_output=True, text=True, env=environment())
+        done = subprocess.run(words, capture_output=True, text=True, env=subprocess_environment())
         written = Path(folder) / "result.json"
         if not written.exists():
             raise RuntimeError(

@@ -83,7 +83,7 @@ def half_cylinder(
     problem, _, u, load = problems.problem(
         body, degree, law, method="lbfgs", petsc_options={"snes_rtol": rtol}
     )
-    *_, last = fc.increments(problem, load, 0.0, body.end, steps=steps, estimate=True)
+    *_, last = fc.increments(problem, load, 0.0, body.final_load, steps=steps, estimate=True)
     budget = fc.estimate_errors(
         problem, stress(u, body.E, body.nu), increment_error=last.increment_error
     )

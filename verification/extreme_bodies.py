@@ -18,10 +18,10 @@ import fenics_contact as fc
 from fenics_contact import compat
 from fenics_contact.elasticity import NeoHookean
 from scenes.bodies import boxes
-from scenes.comparing import at_points
-from scenes.elasticity import displacement_space, hold
-from scenes.rubber import TIGHT, rubber
-from scenes.tags import between, either, near
+from scenes.comparison import point_values
+from scenes.elasticity import dirichlet_bc, displacement_space
+from scenes.rubber import TIGHT_TOLERANCE, rubber
+from scenes.tags import any_of, at_coordinate, at_interface
 from verification import sliding_reference, sliding_scenes
 from verification.extreme_finite import NU, E, bisect, nominal, relative, solved_twice, stress
 from verification.extreme_scenes import Array, Solve, friction_law
@@ -81,10 +81,12 @@ class Two:
             [np.linspace(left, left + width, m + 1), np.linspace(low, low + 1.0, rows + 1)]
             for left, width, m, low in zip(lefts, widths, n, (0.0, 1.0), strict=True)
         ]
-        sides = {LEFT: either(*(near(0, left) for left in lefts))}
-        sides[RIGHT] = either(*(near(0, a + b) for a, b in zip(lefts, widths, strict=True)))
-        sides |= {BOTTOM: near(1, 0.0), TOP: near(1, 2.0)}
-        sides |= {LOWER: between(1, 1.0, above=False), UPPER: between(1, 1.0, above=True)}
+        sides = {LEFT: any_of(*(at_coordinate(0, left) for left in lefts))}
+        sides[RIGHT] = any_of(
+            *(at_coordinate(0, a + b) for a, b in zip(lefts, widths, strict=True))
+        )
+        sides |= {BOTTOM: at_coordinate(1, 0.0), TOP: at_coordinate(1, 2.0)}
+        sides |= {LOWER: at_interface(1, 1.0, above=False), UPPER: at_interface(1, 1.0, above=True)}
         mesh, tags = boxes(lines, sides)
         cells = np.arange(mesh.topology.index_map(2).size_local, dtype=np.int32)
         upper = dolfinx.mesh.compute_midpoints(mesh, 2, cells)[:, 1] > 1.0
@@ -103,10 +105,14 @@ class Two:
                 self._led.append(fem.dirichletbc(fem.Function(V), dofs))
         bcs = list(self._led)
         if ends == "pushed":
-            bcs = [hold(u, tags, BOTTOM, i) for i in range(2)] + [hold(u, tags, TOP, 0)]
+            bcs = [dirichlet_bc(u, tags, BOTTOM, i) for i in range(2)] + [
+                dirichlet_bc(u, tags, TOP, 0)
+            ]
         elif ends != "led":
-            bcs = [hold(u, tags, BOTTOM, 1), hold(u, tags, TOP, 1, self._top[1])]
-            bcs += [hold(u, tags, side, 0) for side in (LEFT, RIGHT)[: 1 + (ends == "confined")]]
+            bcs = [dirichlet_bc(u, tags, BOTTOM, 1), dirichlet_bc(u, tags, TOP, 1, self._top[1])]
+            bcs += [
+                dirichlet_bc(u, tags, side, 0) for side in (LEFT, RIGHT)[: 1 + (ends == "confined")]
+            ]
         body = NeoHookean(u, modulus, NU, "plane strain")
         ds = ufl.ds(mesh, subdomain_data=tags)
         F = body.residual(v) + self.push * v[1] * ds(TOP)
@@ -119,7 +125,7 @@ class Two:
             kinematics="finite",
         )
         self.problem = fc.ContactProblem(
-            F, u, bcs=bcs, contacts=[self.contact], method=method, petsc_options=TIGHT
+            F, u, bcs=bcs, contacts=[self.contact], method=method, petsc_options=TIGHT_TOLERANCE
         )
 
     @property
@@ -157,9 +163,9 @@ def rotated_together(steps: int, mu: float = 0.3, angle: float = 2 * np.pi, **tw
     def solve(method: str) -> tuple[list[fc.Step], float]:
         both = Two(method, mu=mu, rounded=0.1, **two)
         made = both.lead(0.0, DOWN, 2) + both.lead(0.05, DOWN, 2)
-        before = at_points(both.contact, both.contact.traction)
+        before = point_values(both.contact, both.contact.traction)
         made += both.lead(0.05, DOWN, steps, angle)
-        now = at_points(both.contact, both.contact.traction)
+        now = point_values(both.contact, both.contact.traction)
         return made, relative(now, before @ turn(2, angle).T)
 
     return solve
@@ -311,7 +317,7 @@ def stiff_plate(ratio: float, mu: float, n: tuple[int, int] = (8, 4), kappa: flo
         shift = fem.Constant(block.mesh, np.zeros(2))
         plate = fc.HalfSpace((0.0, 1.0), (0.0, -1.0), displacement=shift)
         law = friction_law(mu, kappa * E * 4)
-        options = {"contact": {"points_degree": 2 * points - 1}, "petsc_options": TIGHT}
+        options = {"contact": {"points_degree": 2 * points - 1}, "petsc_options": TIGHT_TOLERANCE}
         problem, contact = block.problem(plate, law, method=method, **options)
         found = []
         for t in range(1, 5):

@@ -15,8 +15,8 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.elasticity import NeoHookean
 from scenes.blocks import BOTTOM, LEFT, TOP, block_mesh
-from scenes.elasticity import displacement_space, hold
-from scenes.rubber import TIGHT, Tool, rubber
+from scenes.elasticity import dirichlet_bc, displacement_space
+from scenes.rubber import TIGHT_TOLERANCE, DiscOnRubber, rubber
 from scenes.surfaces import box, circle, ring
 from verification import finite_reference, finite_scenes
 from verification.extreme_scenes import Array, Solve
@@ -31,15 +31,15 @@ def relative(found: Any, wanted: Any) -> float:
     return float(np.abs(found - wanted).max() / np.abs(wanted).max())
 
 
-def _pressed(mu: float, method: str, **options: Any) -> tuple[Tool, list[fc.Step]]:
+def _pressed(mu: float, method: str, **options: Any) -> tuple[DiscOnRubber, list[fc.Step]]:
     """Press the disc into the block by `DEPTH`."""
     law = fc.Coulomb(mu, 1e4, 1e4) if mu else fc.Frictionless(1e4)
-    solver = {"petsc_options": TIGHT, "method": method}
-    tool = Tool(law=law, radius=RADIUS, solver=solver, **options)
-    return tool, [tool.go(0.0, -0.5 * DEPTH), tool.go(0.0, -DEPTH)]
+    solver = {"petsc_options": TIGHT_TOLERANCE, "method": method}
+    tool = DiscOnRubber(law=law, radius=RADIUS, solver=solver, **options)
+    return tool, [tool.solve_increment(0.0, -0.5 * DEPTH), tool.solve_increment(0.0, -DEPTH)]
 
 
-def _led(tool: Tool, end: Any, steps: int) -> list[fc.Step]:
+def _led(tool: DiscOnRubber, end: Any, steps: int) -> list[fc.Step]:
     """Move the tool in equal increments to a lateral and a vertical displacement and an angle."""
     start = np.array([tool.shift.value[0], tool.shift.value[-1], float(tool.angle.value)])
 
@@ -78,14 +78,14 @@ def rotated_together(steps: int, angle: float = 2 * np.pi) -> Solve:
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         tool, made = _pressed(0.3, method)
-        made += [tool.go(0.05, -DEPTH)]
+        made += [tool.solve_increment(0.05, -DEPTH)]
         before, place = tool.tractions(), tool.vector(0.05, -DEPTH)
         centre = tool.vector(0.0, tool.scene.height + RADIUS)
 
         def load(t: float) -> None:
             c, s = np.cos(t * angle), np.sin(t * angle)
             matrix = np.array([[c, -s], [s, c]])
-            tool.scene.place(lambda x: matrix @ x)
+            tool.scene.move_bottom(lambda x: matrix @ x)
             tool.shift.value[:] = matrix @ (centre + place) - centre
             tool.angle.value = t * angle
 
@@ -101,7 +101,7 @@ def slide_over_facets(n: int, steps: int, distance: float) -> Solve:
     def force(method: str, obstacle: Any) -> tuple[list[fc.Step], Array]:
         scene = rubber(n=(8, 4))
         shift = fem.Constant(scene.mesh, np.zeros(2))
-        options = {"method": method, "petsc_options": TIGHT}
+        options = {"method": method, "petsc_options": TIGHT_TOLERANCE}
         problem, contact = scene.problem(obstacle(shift), fc.Coulomb(0.3, 1e4, 1e4), **options)
 
         def press(t: float) -> None:
@@ -138,7 +138,7 @@ def rotate_drum(n: int, steps: int, angle: float) -> Solve:
         shift, turn = fem.Constant(scene.mesh, np.zeros(2)), fem.Constant(scene.mesh, 0.0)
         centre = (0.0, scene.height + RADIUS)
         move = {"displacement": shift, "rotation": fc.Rotation(turn, centre)}
-        options = {"method": method, "petsc_options": TIGHT}
+        options = {"method": method, "petsc_options": TIGHT_TOLERANCE}
         law = fc.Coulomb(0.3, 1e4, 1e4)
         problem, contact = scene.problem(obstacle(centre, move), law, **options)
 
@@ -174,7 +174,7 @@ def slide_off(mu: float, steps: int, linear: bool = True) -> Solve:
         flat = corners[[0, 1, 3, 2], :2]
         plate = fc.RigidSurface(flat, ring(4), displacement=shift)
         law = fc.Coulomb(mu, 1e4, 1e4) if mu else fc.Frictionless(1e4)
-        options = {"method": method, "petsc_options": TIGHT}
+        options = {"method": method, "petsc_options": TIGHT_TOLERANCE}
         problem, contact = scene.problem(plate, law, **options)
 
         def lead(start: Any, end: Any, steps: int) -> list[fc.Step]:
@@ -214,7 +214,7 @@ def column(
         mesh, tags = block_mesh("quadrilateral", n=n, size=(1.0, 1.0))
         u = fem.Function(displacement_space(mesh, 2))
         body = NeoHookean(u, E, NU, "plane strain")
-        bcs = [hold(u, tags, BOTTOM, 1), hold(u, tags, LEFT, 0)]
+        bcs = [dirichlet_bc(u, tags, BOTTOM, 1), dirichlet_bc(u, tags, LEFT, 0)]
         shift = fem.Constant(mesh, np.zeros(2))
         plane = fc.HalfSpace((0.0, 1.0 + gap), (0.0, -1.0), displacement=shift)
         law = fc.Coulomb(mu, k_n, k_n) if mu else fc.Frictionless(k_n)
@@ -222,7 +222,7 @@ def column(
         contact = fc.Contact(u, surface, plane, law, kinematics="finite")
         F = body.residual(_test(u))
         problem = fc.ContactProblem(
-            F, u, bcs=bcs, contacts=[contact], method=method, petsc_options=TIGHT
+            F, u, bcs=bcs, contacts=[contact], method=method, petsc_options=TIGHT_TOLERANCE
         )
         down = gap + 1.0 - share
 
@@ -339,7 +339,7 @@ def close_gap(gap: float, by_force: bool = False) -> Solve:
         if by_force:
             shift = fc.Motion(force=(None, push), displacement=(0.0, None))
         disc = fc.Ball((0.0, scene.height + RADIUS + gap), RADIUS, displacement=shift)
-        options = {"method": method, "petsc_options": TIGHT}
+        options = {"method": method, "petsc_options": TIGHT_TOLERANCE}
         problem, contact = scene.problem(disc, fc.Frictionless(1e4), **options)
 
         def load(t: float) -> None:
@@ -363,8 +363,8 @@ def indent(steps: int, down: float = 0.3, **options: Any) -> Solve:
     """Press the disc into the block without friction; reference: 16 increments."""
 
     def force(method: str, steps: int) -> tuple[list[fc.Step], Array]:
-        solver = {"petsc_options": TIGHT, "method": method}
-        tool = Tool(law=fc.Frictionless(1e4), radius=RADIUS, solver=solver, **options)
+        solver = {"petsc_options": TIGHT_TOLERANCE, "method": method}
+        tool = DiscOnRubber(law=fc.Frictionless(1e4), radius=RADIUS, solver=solver, **options)
         return _led(tool, (0.0, -down, 0.0), steps), tool.resultant()
 
     def solve(method: str) -> tuple[list[fc.Step], float]:

@@ -25,9 +25,9 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.types import Array
 from scenes.bodies import Bodies, boxes, graded
-from scenes.meshes import one_rank_each
-from scenes.processes import command, environment
-from scenes.tags import near
+from scenes.meshes import partition_from_owners
+from scenes.processes import command, subprocess_environment
+from scenes.tags import at_coordinate
 
 BOTTOM, TOP, LEFT, FRONT, OPPOSITE = 1, 2, 3, 4, 5
 E, NU, PRESSURE = 1000.0, 0.3, 1.0
@@ -386,11 +386,11 @@ class Pair:
             for m, low in zip(n, (0.0, 0.5 + APART), strict=True)
         ]
         sides = {
-            BOTTOM: near(1, 0.0),
-            TOP: near(1, 1.0 + APART),
-            LEFT: near(0, 0.0),
-            FRONT: near(1, 0.5),
-            OPPOSITE: near(1, 0.5 + APART),
+            BOTTOM: at_coordinate(1, 0.0),
+            TOP: at_coordinate(1, 1.0 + APART),
+            LEFT: at_coordinate(0, 0.0),
+            FRONT: at_coordinate(1, 0.5),
+            OPPOSITE: at_coordinate(1, 0.5 + APART),
         }
 
         def bend(x: Array) -> Array:
@@ -432,17 +432,17 @@ class Pair:
 
     def press(self) -> float:
         """Apply symmetry conditions; apply and return a pressure of 1e-3 of the smaller modulus."""
-        self.body.hold(BOTTOM, 1)
-        self.body.hold(LEFT, 0)
+        self.body.prescribe(BOTTOM, 1)
+        self.body.prescribe(LEFT, 0)
         pressure = PRESSURE / E * min(self.moduli)
         self.traction.value[1] = -pressure
         return pressure
 
     def drag(self, down: float = 0.03, sideways: float = 0.02) -> None:
         """Clamp the bottom, and move the top down and sideways."""
-        self.body.hold(BOTTOM, 0, 1)
-        self.body.hold(TOP, 0, value=sideways * self.length)
-        self.body.hold(TOP, 1, value=-down * self.length)
+        self.body.prescribe(BOTTOM, 0, 1)
+        self.body.prescribe(TOP, 0, value=sideways * self.length)
+        self.body.prescribe(TOP, 1, value=-down * self.length)
 
     def compressed(self, k_n: float, pressure: float) -> float:
         """Return the relative error of the displacement under uniform pressure, as in `Block`."""
@@ -523,10 +523,14 @@ def hertz(kappa: float, *, enforcement: str = "penalty") -> tuple[Solve, float]:
     def solve(method: str) -> tuple[list[fc.Step], float]:
         x = graded(0.15, 15, far * 0.1, 1.3)
         y = -graded(0.15, 15, far * 0.1, 1.3)[::-1]
-        sides = {BOTTOM: near(1, y[0]), LEFT: near(0, 0.0), FRONT: near(1, 0.0)}
+        sides = {
+            BOTTOM: at_coordinate(1, y[0]),
+            LEFT: at_coordinate(0, 0.0),
+            FRONT: at_coordinate(1, 0.0),
+        }
         body = Bodies(boxes([[x, y]], sides), E, NU, degree=2)
-        body.hold(BOTTOM, 0, 1)
-        body.hold(LEFT, 0)
+        body.prescribe(BOTTOM, 0, 1)
+        body.prescribe(LEFT, 0)
         cylinder = fc.Motion(force=(None, -force / 2))
         gap = body.x[0] ** 2 / (2 * radius)
         obstacle = fc.PrescribedGap(gap, (0.0, 1.0), displacement=cylinder)
@@ -547,7 +551,9 @@ def lower_block_apart(comm: MPI.Comm, n_parts: int, cell_types: Any, cells: Any)
     n_cells = cells[0].size // 4
     n_lower = 6 * 3
     upper = np.arange(max(n_cells - n_lower, 0)) * (n_parts - 1) // max(n_cells - n_lower, 1)
-    return one_rank_each(np.concatenate([np.full(min(n_lower, n_cells), n_parts - 1), upper]))
+    return partition_from_owners(
+        np.concatenate([np.full(min(n_lower, n_cells), n_parts - 1), upper])
+    )
 
 
 def ranked(
@@ -569,9 +575,9 @@ def ranked(
         problem = both.problem(law, method=method)
     else:  # the upper block is unloaded and fixed
         both.body.bcs.clear()
-        both.body.hold(OPPOSITE, 0, 1)
-        both.body.hold(BOTTOM, 0, value=0.02)
-        both.body.hold(BOTTOM, 1, value=0.03)
+        both.body.prescribe(OPPOSITE, 0, 1)
+        both.body.prescribe(BOTTOM, 0, value=0.02)
+        both.body.prescribe(BOTTOM, 1, value=0.03)
         obstacle = fc.Ball((0.5, 2.5), 2.0)
         contact = fc.Contact(both.u, both.surface, obstacle, law)
         problem = fc.ContactProblem(
@@ -593,7 +599,9 @@ def on_one_rank(ranks: int, kind: str, kappa: float, mu: float) -> Solve:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "state"
             words = command(ranks, __file__, kind, kappa, mu, method, path)
-            done = subprocess.run(words, env=environment(), capture_output=True, timeout=120)
+            done = subprocess.run(
+                words, env=subprocess_environment(), capture_output=True, timeout=120
+            )
             if done.returncode:
                 raise RuntimeError(done.stderr.decode(errors="replace")[-300:])
             step, rows, n_facets = pickle.loads(path.read_bytes())

@@ -43,7 +43,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from scenes.processes import command, environment
+from scenes.processes import command, subprocess_environment
 
 __all__ = ["Outcome", "find_solving_method", "list_features", "make_table", "minimise", "run_scene"]
 
@@ -409,7 +409,7 @@ def _start_batch(seeds: list[int], arguments: argparse.Namespace) -> Iterator[di
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,
-            env=environment() | {"OMP_NUM_THREADS": "1"},
+            env=subprocess_environment() | {"OMP_NUM_THREADS": "1"},
             start_new_session=True,
         )
         timed_out: list[bool] = []

@@ -4,8 +4,9 @@
     python3 verification/getfem_two_bodies.py --frictionless     # needs GetFEM 5.4, on Debian
     python3 verification/getfem_two_bodies.py --brick            # python3-getfem
 
-Scene, mesh and elements are those of scenes/rubbed.py: biquadratic cells with three Gauss points
-along each side. GetFEM's raytracing pairs points of the upper block with the lower block.
+Scene, mesh and elements are those of scenes/sliding_rubber_block.py: biquadratic cells with three
+Gauss points along each side. GetFEM's raytracing pairs points of the upper block with the lower
+block.
 
 The penalty pressure is p = k ⟨-g⟩ per undeformed length of the lower side of the upper block, with
 the gap g to the lower block along the present normal n of the upper block. Friction is the value of

@@ -12,7 +12,7 @@ from dolfinx import fem
 
 import fenics_contact as fc
 from scenes.bodies import COMM, Bodies, boxes, graded
-from scenes.tags import either, near
+from scenes.tags import any_of, at_coordinate
 from verification.cases import Estimate, Outcome, Row, case
 
 GROUND, LOAD, AXIS, SURFACE, OPPOSITE = 1, 2, 3, 4, 5
@@ -31,13 +31,13 @@ def flat_punch() -> Outcome:
     x = np.concatenate([(a - fine)[::-1], a + graded(0.05, 8, far - a, 1.15)[1:]])
     y = -graded(0.05, 8, far, 1.15)[::-1]
     sides = {
-        GROUND: near(1, -far),
-        AXIS: near(0, 0),
-        SURFACE: lambda x, cell: near(1, 0)(x, cell) & (x[:, 0] < a),
+        GROUND: at_coordinate(1, -far),
+        AXIS: at_coordinate(0, 0),
+        SURFACE: lambda x, cell: at_coordinate(1, 0)(x, cell) & (x[:, 0] < a),
     }
     body = Bodies(boxes([[x, y]], sides), 1000.0, 0.3, degree=2)
-    body.hold(GROUND, 0, 1)
-    body.hold(AXIS, 0)
+    body.prescribe(GROUND, 0, 1)
+    body.prescribe(AXIS, 0)
     punch = fc.HalfSpace((0, 0), (0, -1), displacement=fc.Motion(force=(None, -force / 2)))
     contact = body.contact(SURFACE, punch, fc.Frictionless(fc.RelativeStiffness(100)))
     problem = body.problem(contact)
@@ -82,12 +82,12 @@ def wavy(n: int = 256) -> Outcome:
     full = np.pi * modulus / (1 - nu**2) * amplitude / wave
     y = graded(8 * wave / 2 / n, 8, height, 1.2)
     sides = {
-        SURFACE: near(1, 0),
-        LOAD: near(1, height),
-        AXIS: either(near(0, 0), near(0, wave / 2)),
+        SURFACE: at_coordinate(1, 0),
+        LOAD: at_coordinate(1, height),
+        AXIS: any_of(at_coordinate(0, 0), at_coordinate(0, wave / 2)),
     }
     body = Bodies(boxes([[np.linspace(0, wave / 2, n + 1), y]], sides), modulus, nu)
-    body.hold(AXIS, 0)
+    body.prescribe(AXIS, 0)
     load = body.constant(0.0)
     body.F += load * body.v[1] * body.ds(LOAD)
     gap = amplitude * (1 - ufl.cos(2 * np.pi / wave * body.x[0]))
@@ -192,8 +192,8 @@ def cylinder(h: float = 0.25, stiffness: float = 10.0) -> Outcome:
     """
     made = cylinder_on_block(h)
     body = Bodies(made, _moduli(made[0], 210e3, 70e3), 0.3, degree=2)
-    body.hold(GROUND, 0, 1)
-    body.hold(AXIS, 0)
+    body.prescribe(GROUND, 0, 1)
+    body.prescribe(AXIS, 0)
     total = 35e3
     # The traction on the cap of the cylinder has the given resultant.
     width = _integral(body, LOAD)

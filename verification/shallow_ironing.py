@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from demos.shallow_ironing import Setting, solve
-from scenes.processes import ROOT, command, environment
+from scenes.processes import ROOT, command, subprocess_environment
 from verification import report
 from verification import shallow_ironing_page as page
 
@@ -129,7 +129,7 @@ def started(name: str) -> tuple[dict[str, Any], list[tuple[float, float, float]]
     words = command(1, Path(__file__), "--one", name)
     try:
         done = subprocess.run(
-            words, env=environment(), capture_output=True, text=True, timeout=TIMEOUT
+            words, env=subprocess_environment(), capture_output=True, text=True, timeout=TIMEOUT
         )
         if done.returncode == 0:
             row, curve = json.loads(done.stdout.strip().splitlines()[-1])

@@ -6,7 +6,7 @@ import numpy as np
 
 import fenics_contact as fc
 from scenes.bodies import Bodies, boxes, graded
-from scenes.tags import near
+from scenes.tags import at_coordinate
 from verification.cases import Outcome, Row, case
 
 GROUND, TOP, AXIS, SURFACE, OPPOSITE = 1, 2, 3, 4, 5
@@ -32,19 +32,19 @@ def spheres() -> Outcome:
         deep = side * graded(2.0 / n, 2, far, 1.45)
         axes.append([np.concatenate([-half[:0:-1], half]), half, np.sort(deep)])
     sides = {
-        GROUND: near(2, -far),
-        TOP: near(2, far),
-        AXIS: near(1, 0),
+        GROUND: at_coordinate(2, -far),
+        TOP: at_coordinate(2, far),
+        AXIS: at_coordinate(1, 0),
         SURFACE: lambda x, cell: _inner(x) & (cell[:, 2] > 0),
         OPPOSITE: lambda x, cell: _inner(x) & (cell[:, 2] < 0),
     }
     body = Bodies(boxes(axes, sides), modulus, nu, degree=2)
     down, along = body.constant(0.0), body.constant(0.0)
-    body.hold(GROUND, 0, 1, 2)
-    body.hold(TOP, 2, value=down)
-    body.hold(TOP, 0, value=along)
-    body.hold(TOP, 1)
-    body.hold(AXIS, 1)
+    body.prescribe(GROUND, 0, 1, 2)
+    body.prescribe(TOP, 2, value=down)
+    body.prescribe(TOP, 0, value=along)
+    body.prescribe(TOP, 1)
+    body.prescribe(AXIS, 1)
     x = body.x
     law = fc.Coulomb(friction, k_n=fc.RelativeStiffness(20), k_t=fc.RelativeStiffness(20))
     gap = (x[0] ** 2 + x[1] ** 2) / (2 * radius)
@@ -96,4 +96,4 @@ def spheres() -> Outcome:
 
 
 def _inner(x: np.ndarray) -> np.ndarray:
-    return near(2, 0)(x, x) & (np.abs(x[:, :2]).max(axis=1) < 1.2)
+    return at_coordinate(2, 0)(x, x) & (np.abs(x[:, :2]).max(axis=1) < 1.2)

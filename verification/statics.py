@@ -11,7 +11,7 @@ from dolfinx import fem
 
 import fenics_contact as fc
 from scenes.bodies import COMM, Bodies, boxes
-from scenes.tags import between, either, near
+from scenes.tags import any_of, at_coordinate, at_interface
 from verification.cases import Estimate, Outcome, Row, case
 
 BASE, TOP, LEFT, RIGHT, SEAT = 1, 2, 3, 4, 5
@@ -20,7 +20,12 @@ BASE, TOP, LEFT, RIGHT, SEAT = 1, 2, 3, 4, 5
 def block(n: tuple[int, int], size: tuple[float, float] = (1.0, 1.0), **kwargs):
     """Mesh a rectangle with tagged sides."""
     axes = [[np.linspace(0, length, k + 1) for k, length in zip(n, size, strict=True)]]
-    sides = {BASE: near(1, 0), TOP: near(1, size[1]), LEFT: near(0, 0), RIGHT: near(0, size[0])}
+    sides = {
+        BASE: at_coordinate(1, 0),
+        TOP: at_coordinate(1, size[1]),
+        LEFT: at_coordinate(0, 0),
+        RIGHT: at_coordinate(0, size[0]),
+    }
     return boxes(axes, sides, **kwargs)
 
 
@@ -90,13 +95,13 @@ def wedge() -> Outcome:
             return np.column_stack([x[:, 0], y])
 
         sides = {
-            BASE: near(1, 0),
-            SEAT: between(1, 1, above=False),
-            TOP: between(1, 1, above=True),
-            LEFT: lambda x, cell: near(0, 200)(x, cell) & (cell[:, 1] > 1),
+            BASE: at_coordinate(1, 0),
+            SEAT: at_interface(1, 1, above=False),
+            TOP: at_interface(1, 1, above=True),
+            LEFT: lambda x, cell: at_coordinate(0, 200)(x, cell) & (cell[:, 1] > 1),
         }
         body = Bodies(boxes([[long, low], [short, high]], sides, bend=bend), 206e3, 0.3)
-        body.hold(BASE, 0, 1)
+        body.prescribe(BASE, 0, 1)
         marked = fem.Function(fem.functionspace(body.mesh, ("DG", 0)))
         middle = marked.function_space.tabulate_dof_coordinates()
         marked.x.array[:] = middle[:, 1] > 200 + SLOPE * middle[:, 0]
@@ -131,7 +136,11 @@ def capstan() -> Outcome:
     radius, thickness, angle, tension, n = 100.0, 0.5, np.pi, 1.0, 240
     for friction in (0.1, 0.3):
         axes = [[np.linspace(0, angle, n + 1), np.array([0.0, thickness / 2, thickness])]]
-        sides = {BASE: near(1, 0), LEFT: near(0, 0), RIGHT: near(0, angle)}
+        sides = {
+            BASE: at_coordinate(1, 0),
+            LEFT: at_coordinate(0, 0),
+            RIGHT: at_coordinate(0, angle),
+        }
 
         def bend(x: np.ndarray) -> np.ndarray:
             r = radius + x[:, 1]
@@ -139,7 +148,7 @@ def capstan() -> Outcome:
 
         body = Bodies(boxes(axes, sides, bend=bend, degree=2), 1e4, 0.0, degree=2)
         pull, draw = body.constant(0.0), body.constant(0.0)
-        body.hold(LEFT, 1, value=draw)  # at angle 0 the belt is parallel to y
+        body.prescribe(LEFT, 1, value=draw)  # at angle 0 the belt is parallel to y
         body.F += pull * body.v[1] * body.ds(RIGHT)
         law = fc.Coulomb(friction, k_n=20.0, k_t=20.0)
         contact = body.contact(BASE, fc.Cylinder((0, 0), radius), law)
@@ -175,12 +184,12 @@ def incline() -> Outcome:
         [np.linspace(1, 2, 13), np.linspace(0, 0.4, 6)],
     ]
     sides = {
-        BASE: near(1, -1),
-        SEAT: between(1, 0, above=False),
-        TOP: between(1, 0, above=True),
+        BASE: at_coordinate(1, -1),
+        SEAT: at_interface(1, 0, above=False),
+        TOP: at_interface(1, 0, above=True),
     }
     body = Bodies(boxes(axes, sides), 1000.0, 0.3)
-    body.hold(BASE, 0, 1)
+    body.prescribe(BASE, 0, 1)
     tilt = body.constant(0.0)
     marked = fem.Function(fem.functionspace(body.mesh, ("DG", 0)))
     marked.x.array[:] = marked.function_space.tabulate_dof_coordinates()[:, 1] > 0
@@ -247,7 +256,7 @@ def homogeneity() -> Outcome:
 def _sheared(made: Any, method: str, load: float, steps: int) -> tuple[np.ndarray, fc.Resultants]:
     """Solve the block of Raous; return the displacements of this rank and the resultants."""
     body = Bodies(made, 130e3, 0.2)
-    body.hold(RIGHT, 0)
+    body.prescribe(RIGHT, 0)
     grow = body.constant(0.0)
     body.F += 50 * grow * body.v[1] * body.ds(TOP) - 150 * grow * body.v[0] * body.ds(LEFT)
     contact = body.contact(BASE, fc.HalfSpace((0, 0), (0, 1)), fc.Coulomb(1.0))
@@ -284,16 +293,16 @@ def patch() -> Outcome:
             [np.linspace(0, 1, 6), np.linspace(0.5, 1, 3)],
         ]
         sides = {
-            BASE: near(1, 0),
-            TOP: near(1, 1),
-            LEFT: either(near(0, 0), near(0, 1)),
-            SEAT: between(1, 0.5, above=False),
-            RIGHT: between(1, 0.5, above=True),
+            BASE: at_coordinate(1, 0),
+            TOP: at_coordinate(1, 1),
+            LEFT: any_of(at_coordinate(0, 0), at_coordinate(0, 1)),
+            SEAT: at_interface(1, 0.5, above=False),
+            RIGHT: at_interface(1, 0.5, above=True),
         }
         body = Bodies(boxes(axes, sides), 1e6, nu, degree=2)
-        body.hold(BASE, 1)
-        body.hold(LEFT, 0)
-        body.hold(TOP, 1, value=-0.01)
+        body.prescribe(BASE, 1)
+        body.prescribe(LEFT, 0)
+        body.prescribe(TOP, 1, value=-0.01)
         law = fc.Coulomb(0.3, k_n=k_n, k_t=1e6)
         contact = body.contact(SEAT, RIGHT, law)
         problem = body.problem(contact)
@@ -311,9 +320,9 @@ def patch() -> Outcome:
             rows.append(Row(f"{name}, farthest point, ν = {nu:g}", farthest, exact, source, 1e-9))
     # Nearly exact contact of the blocks with ν = 0: the jump is 1e-6 of the displacement.
     body = Bodies(boxes(axes, sides), 1e6, 0.0, degree=2)
-    body.hold(BASE, 1)
-    body.hold(LEFT, 0)
-    body.hold(TOP, 1, value=-0.01)
+    body.prescribe(BASE, 1)
+    body.prescribe(LEFT, 0)
+    body.prescribe(TOP, 1, value=-0.01)
     contact = body.contact(SEAT, RIGHT, fc.Frictionless(1e12))
     problem = body.problem(contact, method="newton")
     problem.solve()

@@ -15,12 +15,17 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
-from scenes.beside import BUSY, Beside, Box
 from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP
-from scenes.comparing import assemble_number, close, compiled, raised_everywhere
+from scenes.comparison import (
+    assemble_scalar,
+    assert_raised_on_all_ranks,
+    compile_with_maps,
+    is_close,
+)
 from scenes.elasticity import strain
-from scenes.laws import Bond
-from scenes.two_blocks import Slider
+from scenes.two_blocks import SlidingBlock
+from scenes.unrelated_bodies import UNRELATED_BODIES, Box, SceneWithUnrelatedBodies
+from scenes.user_laws import Adhesive
 from verification import sliding_scenes
 from verification.fuzz_setup import run_history
 from verification.sliding_scenes import SlidingSetup
@@ -35,7 +40,7 @@ LOAD = 0.02
 WIDTH, HEIGHT = 0.5, 1.0
 
 
-class Led:
+class SlidingPair:
     """A block that is moved along a body below it.
 
     Attributes:
@@ -48,15 +53,15 @@ class Led:
 
     def press(self):
         """Solve and commit the first increment, with the block pressed down."""
-        self.scene.keep_busy(0.5)
+        self.scene.set_unrelated_load(0.5)
         self.problem.solve()
         self.problem.commit()
         return self
 
-    def lead(self, way, steps=1):
+    def slide_by(self, slide, steps=1):
         """Move the block along the body, in equal increments."""
-        self.scene.keep_busy(1.0)
-        return list(fc.increments(self.problem, self.along, 0.0, way, steps=steps))
+        self.scene.set_unrelated_load(1.0)
+        return list(fc.increments(self.problem, self.along, 0.0, slide, steps=steps))
 
     @property
     def force(self):
@@ -64,39 +69,39 @@ class Led:
         return self.contact.resultants().normal_force
 
 
-def on_cantilever(start, law=None, busy=(), *, load=-LOAD, clearance=0.0, **options):
+def on_cantilever(start, law=None, unrelated=(), *, load=-LOAD, clearance=0.0, **options):
     """Set up a block on a cantilever of length 10, with a vertical traction or a clearance."""
     boxes = {
         "beam": Box((0.0, 0.0), (10.0, HEIGHT), (80, 4)),
         "block": Box((start, HEIGHT + clearance), (WIDTH, 0.5), (6, 6)),
     }
-    scene = Beside(boxes, busy, E=1e5)
+    scene = SceneWithUnrelatedBodies(boxes, unrelated, E=1e5)
     along = scene.bodies.constant(0.0)
-    scene.hold("beam", LEFT, 0, 1)
-    scene.hold("block", TOP, 0, value=along)
+    scene.prescribe("beam", LEFT, 0, 1)
+    scene.prescribe("block", TOP, 0, value=along)
     if clearance:
-        scene.hold("block", TOP, 1)
+        scene.prescribe("block", TOP, 1)
     else:
         scene.load("block", TOP, 1, load)
     law = fc.Frictionless() if law is None else law
-    return Led(scene, along, scene.contact("block", BOTTOM, ("beam", TOP), law, **options))
+    return SlidingPair(scene, along, scene.contact("block", BOTTOM, ("beam", TOP), law, **options))
 
 
-def moment(led):
+def moment(pair):
     """Return the moment of the clamp's reactions about the origin: their work on a rotation."""
-    bodies, space = led.scene.bodies, led.scene.bodies.u.function_space
+    bodies, space = pair.scene.bodies, pair.scene.bodies.u.function_space
     rotation = fem.Function(space)
     rotation.interpolate(lambda x: np.array([-x[1], x[0]]))
-    facets = bodies.tags.find(led.scene.tag("beam", LEFT))
+    facets = bodies.tags.find(pair.scene.tag("beam", LEFT))
     held = fem.locate_dofs_topological(space, 1, facets)
     only = fem.Function(space)
     dofs = (2 * held[:, None] + np.arange(2)).ravel()
     only.x.array[dofs] = rotation.x.array[dofs]
     only.x.scatter_forward()
-    return assemble_number(compiled(ufl.replace(bodies.F, {bodies.v: only})), COMM)
+    return assemble_scalar(compile_with_maps(ufl.replace(bodies.F, {bodies.v: only})), COMM)
 
 
-def on_slab(start, law=None, busy=(), *, width=3.0, soft=1.0, spring=None, **options):
+def on_slab(start, law=None, unrelated=(), *, width=3.0, soft=1.0, spring=None, **options):
     """Set up a block on a slab that may be softer beyond x = 1.5; its top is lowered by 0.002.
 
     The horizontal displacement is prescribed at its top, or at the end of a spring on its top.
@@ -105,19 +110,19 @@ def on_slab(start, law=None, busy=(), *, width=3.0, soft=1.0, spring=None, **opt
         "slab": Box((0.0, 0.0), (width, 0.5), (8 * round(width), 4)),
         "block": Box((start, 0.5), (1.0, 0.5), (8, 4)),
     }
-    scene = Beside(boxes, busy, E=1e5)
+    scene = SceneWithUnrelatedBodies(boxes, unrelated, E=1e5)
     bodies, x = scene.bodies, ufl.SpatialCoordinate(scene.bodies.mesh)
     modulus = ufl.conditional(ufl.And(ufl.gt(x[0], 1.5), ufl.lt(x[1], 0.5)), soft, 1.0)
     bodies.F = ufl.inner(modulus * bodies.stress, strain(bodies.v)) * ufl.dx(bodies.mesh)
     along = bodies.constant(0.0)
-    scene.hold("slab", BOTTOM, 0, 1)
+    scene.prescribe("slab", BOTTOM, 0, 1)
     if spring is None:
-        scene.hold("block", TOP, 0, value=along)
+        scene.prescribe("block", TOP, 0, value=along)
     else:
         scene.load("block", TOP, 0, spring * (along - bodies.u[0]))
-    scene.hold("block", TOP, 1, value=-0.002)
+    scene.prescribe("block", TOP, 1, value=-0.002)
     law = fc.Frictionless() if law is None else law
-    return Led(scene, along, scene.contact("block", BOTTOM, ("slab", TOP), law, **options))
+    return SlidingPair(scene, along, scene.contact("block", BOTTOM, ("slab", TOP), law, **options))
 
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
@@ -128,36 +133,36 @@ def test_clamp_moment_of_a_load_sliding_on_a_cantilever(steps, enforcement):
     Reference: statics, 1e-4. The pairs are those at most a hundredth of a facet from the end, or
     1.6e-4 of the arm, on both sides of it. Those at the start would give 15 % of the moment.
     """
-    led = on_cantilever(1.0, enforcement=enforcement).press()
-    assert moment(led) == pytest.approx(LOAD * WIDTH * (1.0 + WIDTH / 2), rel=1e-6)
-    led.lead(7.0, steps)
-    assert led.force == pytest.approx(LOAD * WIDTH, rel=1e-6)
-    assert moment(led) == pytest.approx(LOAD * WIDTH * (8.0 + WIDTH / 2), rel=1e-4)
+    pair = on_cantilever(1.0, enforcement=enforcement).press()
+    assert moment(pair) == pytest.approx(LOAD * WIDTH * (1.0 + WIDTH / 2), rel=1e-6)
+    pair.slide_by(7.0, steps)
+    assert pair.force == pytest.approx(LOAD * WIDTH, rel=1e-6)
+    assert moment(pair) == pytest.approx(LOAD * WIDTH * (8.0 + WIDTH / 2), rel=1e-4)
 
 
-@pytest.mark.parametrize("busy", BUSY)
-def test_slide_with_an_unrelated_body(busy):
+@pytest.mark.parametrize("unrelated", UNRELATED_BODIES)
+def test_slide_with_an_unrelated_body(unrelated):
     """An unrelated body changes neither the moment nor the contact force, to 1e-6."""
-    led = on_cantilever(1.0, fc.Coulomb(0.2)).press()
-    led.lead(7.0)
-    other = on_cantilever(1.0, fc.Coulomb(0.2), busy=[BUSY[busy]]).press()
-    other.lead(7.0)
-    assert moment(other) == pytest.approx(moment(led), rel=1e-6)
-    assert close(other.contact.resultants().force, led.contact.resultants().force, 1e-6)
+    pair = on_cantilever(1.0, fc.Coulomb(0.2)).press()
+    pair.slide_by(7.0)
+    other = on_cantilever(1.0, fc.Coulomb(0.2), unrelated=[UNRELATED_BODIES[unrelated]]).press()
+    other.slide_by(7.0)
+    assert moment(other) == pytest.approx(moment(pair), rel=1e-6)
+    assert is_close(other.contact.resultants().force, pair.contact.resultants().force, 1e-6)
 
 
 @pytest.mark.parametrize("steps", [1, 10])
-@pytest.mark.parametrize("way", [0.5, 1.125, 1.625])
-def test_slide_from_stiff_to_soft_slab(way, steps):
+@pytest.mark.parametrize("slide", [0.5, 1.125, 1.625])
+def test_slide_from_stiff_to_soft_slab(slide, steps):
     """The block slides onto a part of the slab, x > 1.5, with a hundredth of the stiffness.
 
     Reference: the force of the block meshed at its end position, 2 %, as the normals are those of
     the undeformed surface and the block stands across a step of the stiffness. The nodes of both
     surfaces coincide there, so that both scenes have the same mesh.
     """
-    led = on_slab(0.25, soft=1e-2).press()
-    led.lead(way, steps)
-    assert led.force == pytest.approx(on_slab(0.25 + way, soft=1e-2).press().force, rel=0.02)
+    pair = on_slab(0.25, soft=1e-2).press()
+    pair.slide_by(slide, steps)
+    assert pair.force == pytest.approx(on_slab(0.25 + slide, soft=1e-2).press().force, rel=0.02)
 
 
 @pytest.mark.parametrize("gap", [None, 0.0])
@@ -165,9 +170,9 @@ def test_slide_from_stiff_to_soft_slab(way, steps):
 def test_slide_from_an_overhang_onto_the_slab(steps, gap):
     """An overhanging block (7/8) is moved onto the slab: the force of one meshed there, 0.5 %."""
     options = {} if gap is None else {"gap": gap}
-    led = on_slab(-0.875, **options).press()
-    led.lead(1.25, steps)
-    assert led.force == pytest.approx(on_slab(0.375).press().force, rel=5e-3)
+    pair = on_slab(-0.875, **options).press()
+    pair.slide_by(1.25, steps)
+    assert pair.force == pytest.approx(on_slab(0.375).press().force, rel=5e-3)
 
 
 def test_repeated_solves_give_the_same_solution():
@@ -186,17 +191,17 @@ def test_repeated_solves_give_the_same_solution():
     number = again.contact.pairs.n_updates
     again.along.value = 1.0
     again.problem.small_displacement_tolerance = 0.0
-    raised_everywhere(again.problem.solve, fc.NotConverged)
+    assert_raised_on_all_ranks(again.problem.solve, fc.NotConverged)
     again.problem.small_displacement_tolerance = 0.2
     assert again.contact.pairs.n_updates > number
-    assert close(again.contact.contact_kinematics.present_jump(), state, 1e-12)
+    assert is_close(again.contact.contact_kinematics.present_jump(), state, 1e-12)
     again.problem.commit()
-    for led in (once, again):
-        led.along.value = 0.75
-        led.problem.solve()
-    assert close(again.contact.resultants().force, once.contact.resultants().force, 1e-8)
+    for pair in (once, again):
+        pair.along.value = 0.75
+        pair.problem.solve()
+    assert is_close(again.contact.resultants().force, once.contact.resultants().force, 1e-8)
     again.problem.restore()
-    assert close(again.contact.resultants().force, state_of(once), 1e-8)
+    assert is_close(again.contact.resultants().force, state_of(once), 1e-8)
 
 
 def solutions_of(step):
@@ -214,23 +219,23 @@ def test_increments_with_predicted_pairs_need_one_solve(spring):
     def make():
         return on_slab(0.25, fc.Coulomb(0.2), spring=spring).press()
 
-    led, numbers = make(), []
-    for way in (0.1, 0.25, 0.4, 0.5, 0.65, 0.7, 0.55):
-        led.along.value = way
-        numbers.append(solutions_of(led.problem.solve()))
-        led.problem.commit()
+    pair, numbers = make(), []
+    for slide in (0.1, 0.25, 0.4, 0.5, 0.65, 0.7, 0.55):
+        pair.along.value = slide
+        numbers.append(solutions_of(pair.problem.solve()))
+        pair.problem.commit()
     # First pairs are those of the undeformed bodies, then slip starts; the last one reverses.
     assert numbers[2:6] == [1] * 4
     assert 1 < numbers[6] < 5
     fewer = make()
-    for way in (0.7, 0.55):
-        fewer.along.value = way
+    for slide in (0.7, 0.55):
+        fewer.along.value = slide
         fewer.problem.solve()
         fewer.problem.commit()
-    assert close(led.contact.resultants().force, fewer.contact.resultants().force, 1e-3)
+    assert is_close(pair.contact.resultants().force, fewer.contact.resultants().force, 1e-3)
 
 
-def between_walls(law, ways, downs, start=0.5, *, loaded=False, **options):
+def between_walls(law, displacements, downs, start=0.5, *, loaded=False, **options):
     """Push a block along a slab of length 4 by walls, one increment for each displacement.
 
     The vertical displacement of its top is prescribed, or a traction (``loaded``).
@@ -239,13 +244,13 @@ def between_walls(law, ways, downs, start=0.5, *, loaded=False, **options):
         "slab": Box((0.0, 0.0), (4.0, 0.5), (32, 4)),
         "block": Box((start, 0.5), (1.0, 0.5), (8, 4)),
     }
-    scene = Beside(boxes, E=1e5)
+    scene = SceneWithUnrelatedBodies(boxes, E=1e5)
     push, down = fem.Constant(scene.bodies.mesh, (0.0, 0.0)), scene.bodies.constant(0.0)
-    scene.hold("slab", BOTTOM, 0, 1)
+    scene.prescribe("slab", BOTTOM, 0, 1)
     if loaded:
         scene.load("block", TOP, 1, down)
     else:
-        scene.hold("block", TOP, 1, value=down)
+        scene.prescribe("block", TOP, 1, value=down)
     walls = [
         fc.HalfSpace((start, 0), (1, 0), displacement=push),
         fc.HalfSpace((start + 1, 0), (-1, 0), displacement=push),
@@ -257,7 +262,7 @@ def between_walls(law, ways, downs, start=0.5, *, loaded=False, **options):
     )
     problem = scene.problem(contact, left, right)
     steps = []
-    for push.value[0], down.value in zip(ways, downs, strict=True):
+    for push.value[0], down.value in zip(displacements, downs, strict=True):
         steps.append(problem.solve())
         problem.commit()
     return [step.contacts["contact"].force for step in steps], steps
@@ -275,7 +280,7 @@ def test_wrong_pair_prediction_keeps_contact_forces(law, sign):
     downs = -sign * np.linspace(2e-3, 2.4e-3, 5)
     found, _ = between_walls(law, (0.0, 0.3, 2.4, 2.3, 2.2), downs, gap=0.0)
     there, _ = between_walls(law, (0.0,), downs[3:4], start=2.8, gap=0.0)
-    assert close(found[3], there[0], 1e-3)
+    assert is_close(found[3], there[0], 1e-3)
 
 
 def test_failed_pair_prediction_costs_one_attempt():
@@ -296,35 +301,35 @@ def test_block_leaves_the_slab_and_returns(law):
 
     As the gap is prescribed, no distance indicates the return; an earlier version had no force.
     """
-    led = on_slab(0.25, law, gap=0.0).press()
-    for way in (0.2, 1.4, 3.6, 1.4):
-        led.along.value = way
-        led.problem.solve()
-        led.problem.commit()
-        if way == 3.6:
-            assert led.force == 0.0
+    pair = on_slab(0.25, law, gap=0.0).press()
+    for slide in (0.2, 1.4, 3.6, 1.4):
+        pair.along.value = slide
+        pair.problem.solve()
+        pair.problem.commit()
+        if slide == 3.6:
+            assert pair.force == 0.0
     there = on_slab(0.25 + 1.4, law, gap=0.0).press()
-    assert led.force == pytest.approx(there.force, rel=2e-3)
+    assert pair.force == pytest.approx(there.force, rel=2e-3)
 
 
 def test_unrelated_body_does_not_change_predicted_pairs():
     """A moving unrelated body changes the force of a resting block by 1e-6 at most, not by 1e-4."""
     forces = []
-    for busy in ([], [BUSY["rubbed"]]):
-        led = on_slab(0.25, fc.Coulomb(0.3), busy).press()
-        for share, way in ((1.0, 0.5), (1.5, 1.0), (2.0, 1.0)):
-            led.scene.keep_busy(share)
-            led.along.value = way
-            led.problem.solve()
-            led.problem.commit()
-        forces.append(led.contact.resultants().force)
-    assert close(*forces, 1e-6)
+    for unrelated in ([], [UNRELATED_BODIES["sliding"]]):
+        pair = on_slab(0.25, fc.Coulomb(0.3), unrelated).press()
+        for share, slide in ((1.0, 0.5), (1.5, 1.0), (2.0, 1.0)):
+            pair.scene.set_unrelated_load(share)
+            pair.along.value = slide
+            pair.problem.solve()
+            pair.problem.commit()
+        forces.append(pair.contact.resultants().force)
+    assert is_close(*forces, 1e-6)
 
 
-def state_of(led):
+def state_of(pair):
     """Return the contact force of the committed state."""
-    led.problem.restore()
-    return led.contact.resultants().force
+    pair.problem.restore()
+    return pair.contact.resultants().force
 
 
 @pytest.mark.parametrize("field", ["every", "last"])
@@ -338,9 +343,9 @@ def test_interrupted_history_continues(field, tmp_path):
     def make():
         return on_slab(0.25, fc.Coulomb(0.3), soft=0.1)
 
-    def load(led):
+    def load(pair):
         def to(t):
-            led.along.value = 0.5 * max(t - 1.0, 0.0)
+            pair.along.value = 0.5 * max(t - 1.0, 0.0)
 
         return to
 
@@ -351,30 +356,30 @@ def test_interrupted_history_continues(field, tmp_path):
     steps.close()
     again = make()
     list(fc.increments(again.problem, load(again), 0.0, 4.0, steps=4, checkpoint=path, **options))
-    forces = [led.contact.resultants().force for led in (again, whole)]
-    assert close(*forces, 1e-9)
+    forces = [pair.contact.resultants().force for pair in (again, whole)]
+    assert is_close(*forces, 1e-9)
 
 
 def test_fixed_pairs_fail_beyond_a_facet_of_slip():
     """With update_pairs="never" slip beyond a facet fails; if accepted, forces do not move."""
 
     def make():
-        led = on_cantilever(1.0)
+        pair = on_cantilever(1.0)
         obstacle = fc.DeformableBody(
-            led.scene.bodies.tags, led.scene.tag("beam", TOP), update_pairs="never"
+            pair.scene.bodies.tags, pair.scene.tag("beam", TOP), update_pairs="never"
         )
-        contact = led.scene.contact("block", BOTTOM, obstacle, fc.Frictionless(), name="stays")
-        return Led(led.scene, led.along, contact).press()
+        contact = pair.scene.contact("block", BOTTOM, obstacle, fc.Frictionless(), name="stays")
+        return SlidingPair(pair.scene, pair.along, contact).press()
 
-    led = make()
-    led.along.value = 0.05  # less than a facet
-    led.problem.solve()
-    led.along.value = 1.0
-    raised_everywhere(led.problem.solve, fc.NotConverged, "have slid by", "facets")
-    led.problem.small_displacement_tolerance = np.inf
-    led.problem.solve()
-    led.problem.commit()
-    assert moment(led) == pytest.approx(LOAD * WIDTH * (1.0 + WIDTH / 2), rel=1e-6)
+    pair = make()
+    pair.along.value = 0.05  # less than a facet
+    pair.problem.solve()
+    pair.along.value = 1.0
+    assert_raised_on_all_ranks(pair.problem.solve, fc.NotConverged, "have slid by", "facets")
+    pair.problem.small_displacement_tolerance = np.inf
+    pair.problem.solve()
+    pair.problem.commit()
+    assert moment(pair) == pytest.approx(LOAD * WIDTH * (1.0 + WIDTH / 2), rel=1e-6)
 
 
 def test_resting_contact_keeps_its_pairs_while_another_slides():
@@ -384,11 +389,11 @@ def test_resting_contact_keeps_its_pairs_while_another_slides():
         "one": Box((1.0, HEIGHT), (WIDTH, 0.5), (6, 6)),
         "two": Box((8.0, HEIGHT), (WIDTH, 0.5), (6, 6)),
     }
-    scene = Beside(boxes, E=1e5)
+    scene = SceneWithUnrelatedBodies(boxes, E=1e5)
     along = scene.bodies.constant(0.0)
-    scene.hold("beam", LEFT, 0, 1)
-    scene.hold("one", TOP, 0, value=along)
-    scene.hold("two", TOP, 0)
+    scene.prescribe("beam", LEFT, 0, 1)
+    scene.prescribe("one", TOP, 0, value=along)
+    scene.prescribe("two", TOP, 0)
     contacts = []
     for name in ("one", "two"):
         scene.load(name, TOP, 1, -LOAD)
@@ -432,8 +437,8 @@ def random_slide(seed):
     last = scene["stages"][-1] | {"steps": 1, "normal": 1.0}
     scene["stages"][-1]["normal"] = 1.0
     there = copy.deepcopy(scene)
-    for i, way in enumerate(("side", "across")[: len(body["size"]) - 1]):
-        there["bodies"][1]["origin"][i] += last[way] * body["size"][i]
+    for i, slide in enumerate(("side", "across")[: len(body["size"]) - 1]):
+        there["bodies"][1]["origin"][i] += last[slide] * body["size"][i]
     there["stages"] = [last | {"side": 0.0, "across": 0.0}]
     return scene, there
 
@@ -449,15 +454,17 @@ def test_force_after_random_slides(seed):
         records = []
         run_history(scene, COMM, records.append, setup_class=SmallSetup)
         found.append(records[-1]["contacts"][0]["force"])
-    assert close(*found, 0.02)
+    assert is_close(*found, 0.02)
 
 
-@pytest.mark.parametrize("law", [fc.Foundation(1e5), Bond(1e5, 1.0)], ids=["foundation", "bond"])
+@pytest.mark.parametrize(
+    "law", [fc.Foundation(1e5), Adhesive(1e5, 1.0)], ids=["foundation", "bond"]
+)
 def test_tensile_forces_slide_with_the_block(law):
     """Tensile forces move with the block: moment by statics, 1e-4 (15 % of it at the start)."""
-    led = on_cantilever(1.0, law, load=LOAD, gap=0.0).press()
-    led.lead(7.0)
-    assert moment(led) == pytest.approx(-LOAD * WIDTH * (8.0 + WIDTH / 2), rel=1e-4)
+    pair = on_cantilever(1.0, law, load=LOAD, gap=0.0).press()
+    pair.slide_by(7.0)
+    assert moment(pair) == pytest.approx(-LOAD * WIDTH * (8.0 + WIDTH / 2), rel=1e-4)
 
 
 @pytest.mark.parametrize("steps", [1, 10])
@@ -467,9 +474,9 @@ def test_friction_without_pressure(steps):
     The difference is due to the eccentricity of the force, half of the height of the bar.
     """
     E = 1e5 / (1 - 0.3**2)
-    led = on_cantilever(1.0, fc.Tresca(1.0, 1.0), clearance=0.01).press()
-    led.lead(7.0, steps)
-    tip = [fc.output.at_node(led.scene.bodies.u, (10.0, y))[0] for y in (0.0, HEIGHT)]
+    pair = on_cantilever(1.0, fc.Tresca(1.0, 1.0), clearance=0.01).press()
+    pair.slide_by(7.0, steps)
+    tip = [fc.output.at_node(pair.scene.bodies.u, (10.0, y))[0] for y in (0.0, HEIGHT)]
     assert np.mean(tip) == pytest.approx(WIDTH * (8.0 + WIDTH / 2) / (E * HEIGHT), rel=0.02)
 
 
@@ -489,10 +496,10 @@ def in_valley(kinematics, pushes):
         "low": Box((0.0, 0.0), (length, 1.0), (64, 6), bend=valley),
         "block": Box((2 - width / 2, 1.0), (width, 0.5), (16, 6), bend=round_bottom),
     }
-    scene = Beside(boxes, E=100.0)
+    scene = SceneWithUnrelatedBodies(boxes, E=100.0)
     bodies, top = scene.bodies, scene.bodies.ds(scene.tag("block", TOP))
     push = bodies.constant(0.0)
-    scene.hold("low", BOTTOM, 0, 1)
+    scene.prescribe("low", BOTTOM, 0, 1)
     scene.load("block", TOP, 0, push)
     scene.load("block", TOP, 1, -2.0)
     # A weak horizontal spring, and one against rotation of the top.
@@ -503,12 +510,12 @@ def in_valley(kinematics, pushes):
     problem = scene.problem(contact)
     problem.solve()
     problem.commit()
-    ways = []
+    displacements = []
     for push.value in pushes:
         problem.solve()
         problem.commit()
-        ways.append(fc.output.at_node(bodies.u, (1.7, 1.5))[0])
-    return np.array(ways)
+        displacements.append(fc.output.at_node(bodies.u, (1.7, 1.5))[0])
+    return np.array(displacements)
 
 
 def test_pair_iteration_is_relaxed_on_a_curved_surface():
@@ -530,18 +537,18 @@ def test_failed_increment_keeps_the_trial_state():
         "slab": Box((0.0, 0.0), (3.0, 0.5), (24, 4)),
         "block": Box((0.25, 0.5), (1.0, 0.5), (8, 4)),
     }
-    scene = Beside(boxes, E=1e5)
+    scene = SceneWithUnrelatedBodies(boxes, E=1e5)
     along, down = scene.bodies.constant(0.0), scene.bodies.constant(-0.002)
-    scene.hold("slab", BOTTOM, 0, 1)
-    scene.hold("block", TOP, 0, value=along)
-    scene.hold("block", TOP, 1, value=down)
+    scene.prescribe("slab", BOTTOM, 0, 1)
+    scene.prescribe("block", TOP, 0, value=along)
+    scene.prescribe("block", TOP, 1, value=down)
     law = fc.Coulomb(0.3)
     problem = scene.problem(scene.contact("block", BOTTOM, ("slab", TOP), law), condensation=True)
     along.value = 0.01
     assert not problem.solve(recover_interior=False).complete
     along.value, down.value = 1.2, -0.4
     with pytest.warns(UserWarning, match="not committed"):
-        raised_everywhere(problem.solve, fc.NotConverged)
+        assert_raised_on_all_ranks(problem.solve, fc.NotConverged)
     along.value, down.value = 0.01, -0.002
     problem.complete()
     problem.commit()
@@ -555,7 +562,7 @@ def test_contact_slides_beyond_the_retained_dofs():
     """
     forces = []
     for condensation in (True, False):
-        made = Slider(
+        made = SlidingBlock(
             "hexahedron",
             fc.Coulomb(0.3),
             start=0.6,
@@ -566,19 +573,19 @@ def test_contact_slides_beyond_the_retained_dofs():
         made.step(0.005, 0.0)
         step = made.step(0.005, 1.5)
         forces.append(step.contacts["contact"].force)
-    assert close(*forces, 1e-4)
+    assert is_close(*forces, 1e-4)
 
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
-@pytest.mark.parametrize("way", [0.6, 1.0, 1.25, 1.5])
-def test_slides_over_many_facets_are_not_tunnelling(way, enforcement):
+@pytest.mark.parametrize("slide", [0.6, 1.0, 1.25, 1.5])
+def test_slides_over_many_facets_are_not_tunnelling(slide, enforcement):
     """Nodes of the slab that the block leaves behind end in front of its face, not inside of it.
 
     Their straight paths enter it through its bottom and leave it where Γc has no facets: an earlier
     version refused 28 of 64 slides.
     """
-    led = on_slab(0.25, fc.Coulomb(0.3), enforcement=enforcement).press()
-    led.along.value = way
-    slid = led.problem.solve().contacts["contact"]
+    pair = on_slab(0.25, fc.Coulomb(0.3), enforcement=enforcement).press()
+    pair.along.value = slide
+    slid = pair.problem.solve().contacts["contact"]
     assert slid.stick == 0 and slid.slip > 0
     assert slid.tangential_force == pytest.approx(0.3 * slid.normal_force, rel=1e-6)

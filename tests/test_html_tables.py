@@ -8,8 +8,8 @@ import pytest
 
 import fenics_contact as fc
 from fenics_contact.methods.attempt import Attempt
+from scenes.block_on_ball import BlockOnBall
 from scenes.elasticity import stress
-from scenes.rubbing import Rub
 
 pytestmark = pytest.mark.two_ranks
 
@@ -17,15 +17,15 @@ NAME = "<b>one & two</b>"
 
 
 @pytest.fixture(scope="module")
-def solved():
+def solved_block():
     """Return a block moved back and forth, with markup as contact name, and its last step."""
-    made = Rub(contact={"name": NAME}, degree=2)
+    made = BlockOnBall(contact={"name": NAME}, degree=2)
     made.problem.small_displacement_tolerance = np.inf
     *_, step = fc.increments(made.problem, made.load, 0, 2, steps=4, estimate=True)
     return made, step
 
 
-def table(thing):
+def parse_table(thing):
     """Return title, rows and paragraphs of the table of an object, by an XML parser."""
     root = ElementTree.fromstring(f"<div>{thing._repr_html_()}</div>")
     rows = [[cell.text for cell in row] for row in root.iter("tr")]
@@ -34,11 +34,11 @@ def table(thing):
     return root.find(".//caption").text, rows, [p.text for p in root.iter("p")]
 
 
-def test_table_of_a_step(solved):
+def test_table_of_a_step(solved_block):
     """Summary and table of a step have both the resultant and the integral of friction ∫|τ|."""
-    _, step = solved
+    _, step = solved_block
     r = step.contacts[NAME]
-    title, (header, row), (remark, *left_out, units) = table(step)
+    title, (header, row), (remark, *left_out, units) = parse_table(step)
     assert all("assumed small" in text for text in left_out)
     assert units == "Forces and areas are per unit thickness."
     assert title == f"Increment {step.increment}, load 2"
@@ -69,17 +69,17 @@ def test_table_of_a_step(solved):
         (7, "7 iterations"),
     ],
 )
-def test_iterations_of_a_step_in_words(solved, iterations, told):
+def test_iterations_of_a_step_in_words(solved_block, iterations, told):
     """Summary and table state the number of iterations in the same words."""
-    step = replace(solved[1], iterations=iterations, method="newton")
-    for text in (step.summary(), table(step)[2][0]):
+    step = replace(solved_block[1], iterations=iterations, method="newton")
+    for text in (step.summary(), parse_table(step)[2][0]):
         assert f"newton: {told}; residual" in text
 
 
-def test_table_of_a_verdict(solved):
+def test_table_of_a_verdict(solved_block):
     """The table has every condition with its error and limit, and failures below."""
-    made, step = solved
-    title, rows, remarks = table(step.verdict)
+    made, step = solved_block
+    title, rows, remarks = parse_table(step.verdict)
     assert title == "Verdict: holds" and remarks == []
     names = [name for name, *_ in rows]
     assert f"cone, {NAME}" in names
@@ -93,17 +93,17 @@ def test_table_of_a_verdict(solved):
     with pytest.raises(fc.NotConverged) as error:
         made.problem.solve()
     made.problem.small_displacement_tolerance = np.inf
-    title, _, remarks = table(error.value.verdict)
+    title, _, remarks = parse_table(error.value.verdict)
     assert title == "Verdict: does not hold" and remarks == error.value.verdict.failures
 
 
-def test_table_of_an_error_budget(solved):
+def test_table_of_an_error_budget(solved_block):
     """The cells are those of the text; the last row is the total of all parts."""
-    made, step = solved
+    made, step = solved_block
     scene = made.scene
     tensor = stress(scene.u, scene.E, scene.nu)
     budget = fc.estimate_errors(made.problem, tensor, increment_error=step.increment_error)
-    title, (header, *rows), remarks = table(budget)
+    title, (header, *rows), remarks = parse_table(budget)
     assert title == "Error budget" and header[1:] == list(budget.values)
     lines = str(budget).splitlines()
     for line, row in zip(lines[1:], rows[:-1], strict=False):

@@ -11,20 +11,20 @@ import fenics_contact as fc
 from scenes.blocks import Block, block
 
 # Four layers of cells, so that on two and three ranks a fault does not concern all ranks.
-MESH = {"n": (2, 4)}
+LAYERED_MESH = {"n": (2, 4)}
 
 
-def pressed(**options: Any) -> Block:
+def pressed_block(**options: Any) -> Block:
     """Return a block with a pressure of 1 on its top."""
-    return block("quadrilateral", up=-1.0, **MESH, **options)
+    return block("quadrilateral", up=-1.0, **LAYERED_MESH, **options)
 
 
-def coulomb(friction: Any = 0.3, k_n: Any = 1e4, k_t: Any = 1e3) -> fc.Coulomb:
+def coulomb_law(friction: Any = 0.3, k_n: Any = 1e4, k_t: Any = 1e3) -> fc.Coulomb:
     """Return a valid Coulomb law for the pressed block."""
     return fc.Coulomb(friction, k_n=k_n, k_t=k_t)
 
 
-def build_and_solve(
+def make_solve(
     scene: Block,
     law: Any = None,
     bcs: Sequence[fem.DirichletBC] | None = None,
@@ -35,7 +35,7 @@ def build_and_solve(
 
     def call() -> fc.Step:
         conditions = scene.rollers() if bcs is None else bcs
-        problem, _ = scene.problem(law or coulomb(), conditions, contact=contact, **options)
+        problem, _ = scene.problem(law or coulomb_law(), conditions, contact=contact, **options)
         return problem.solve()
 
     return call

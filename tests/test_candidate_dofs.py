@@ -11,9 +11,9 @@ import pytest
 from mpi4py import MPI
 
 import fenics_contact as fc
-from scenes.comparing import close, nodal, same_effort, shared_folder
-from scenes.generous import CELLS, Pressed, Shod
-from scenes.histories import goes_on
+from scenes.comparison import have_similar_iterations, is_close, nodal_values, shared_folder
+from scenes.histories import assert_restart_equals_uninterrupted
+from scenes.oversized_contact_surface import CELLS, BlockUnderShoe, IndentedBlock
 
 pytestmark = [pytest.mark.timeout(240), pytest.mark.mpi]
 COMM = MPI.COMM_WORLD
@@ -25,7 +25,7 @@ TIGHT = {"petsc_options": {"snes_rtol": 1e-12}}
 FEW = 500
 
 
-def kept(made):
+def n_retained_dofs(made):
     """Return the number of retained dofs."""
     system = made.problem.solver.system
     assert made.problem.solver.condensed
@@ -37,12 +37,12 @@ def run(made, end=1.0, steps=2, **options):
     found = list(made.increments(end, steps=steps, **options))
     forces = np.array([step.contacts["contact"].force for step in found])
     counts = [[s.contacts["contact"].stick, s.contacts["contact"].slip] for s in found]
-    return found, {"u": nodal(made.u), "forces": forces, "counts": np.array(counts)}
+    return found, {"u": nodal_values(made.u), "forces": forces, "counts": np.array(counts)}
 
 
 def assert_same(one, other, rtol=SAME):
     for name, value in other.items():
-        assert close(one[name], value, rtol), name
+        assert is_close(one[name], value, rtol), name
 
 
 def n_grown(steps):
@@ -56,15 +56,15 @@ def n_grown(steps):
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_generously_tagged_surface(cell):
     """Results are those of all dofs and of a tight tag; few dofs are retained, condensed once."""
-    made = Pressed(cell=cell, **TIGHT)
+    made = IndentedBlock(cell=cell, **TIGHT)
     steps, found = run(made)
-    assert kept(made) <= FEW
+    assert n_retained_dofs(made) <= FEW
     assert sum(step.factorisations for step in steps) == 1
     assert n_grown(steps) == 0
-    full = Pressed(cell=cell, condensation=False, **TIGHT)
+    full = IndentedBlock(cell=cell, condensation=False, **TIGHT)
     assert_same(found, run(full)[1])
     # The closed points cover a sixth of the tag at most.
-    assert_same(found, run(Pressed(cell=cell, within=0.5, **TIGHT))[1])
+    assert_same(found, run(IndentedBlock(cell=cell, contact_half_width=0.5, **TIGHT))[1])
 
 
 LAWS = {
@@ -78,9 +78,9 @@ LAWS = {
 def test_laws(law):
     """Results agree for laws of every kind, with the ball dragged a little."""
     cell = "tetrahedron" if law == "polygon" else "quadrilateral"
-    made = [Pressed(LAWS[law], cell=cell, condensation=c, **TIGHT) for c in (None, False)]
+    made = [IndentedBlock(LAWS[law], cell=cell, condensation=c, **TIGHT) for c in (None, False)]
     (steps, found), (_, full) = (run(m, 1.2, 3) for m in made)
-    assert kept(made[0]) <= FEW
+    assert n_retained_dofs(made[0]) <= FEW
     assert n_grown(steps) == 0
     assert_same(found, full)
 
@@ -89,9 +89,9 @@ def test_laws(law):
 @pytest.mark.parametrize("method", ["lbfgs", "newton", "alternating", "continuation"])
 def test_methods(method):
     """Results agree for all methods; L-BFGS has fewer digits, with and without condensation."""
-    made = [Pressed(condensation=c, method=method, **TIGHT) for c in (None, False)]
+    made = [IndentedBlock(condensation=c, method=method, **TIGHT) for c in (None, False)]
     (_, found), (_, full) = (run(m) for m in made)
-    assert kept(made[0]) <= FEW
+    assert n_retained_dofs(made[0]) <= FEW
     assert_same(found, full)
 
 
@@ -100,9 +100,9 @@ def test_multipliers():
     tolerance = 1e-6
     options = {"cell": "tetrahedron", "contact": {"enforcement": "augmented"}} | TIGHT
     options["contact"]["tolerance"] = tolerance
-    made = [Pressed(condensation=c, **options) for c in (None, False)]
+    made = [IndentedBlock(condensation=c, **options) for c in (None, False)]
     (steps, found), (_, full) = (run(m, 1.5, 3) for m in made)
-    assert kept(made[0]) <= FEW
+    assert n_retained_dofs(made[0]) <= FEW
     assert max(step.augmentations for step in steps) > 1
     assert_same(found, full, tolerance)
 
@@ -110,9 +110,9 @@ def test_multipliers():
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_ball_pushed_by_a_force(cell):
     """The motion of the ball is unknown: it could close points away from the contact unseen."""
-    made = [Pressed(cell=cell, force=20.0, condensation=c, **TIGHT) for c in (None, False)]
+    made = [IndentedBlock(cell=cell, force=20.0, condensation=c, **TIGHT) for c in (None, False)]
     (_, found), (_, full) = (run(m, 1.2, 3) for m in made)
-    assert kept(made[0]) <= FEW + 1
+    assert n_retained_dofs(made[0]) <= FEW + 1
     assert_same(found, full)
 
 
@@ -122,9 +122,9 @@ def test_body_constrained_by_contact_alone(pressure):
 
     With the larger pressure contact spreads beyond the retained dofs.
     """
-    made = [Pressed(pressure=pressure, condensation=c, **TIGHT) for c in (True, False)]
+    made = [IndentedBlock(pressure=pressure, condensation=c, **TIGHT) for c in (True, False)]
     (steps, found), (_, full) = (run(m, 1.0, 4) for m in made)
-    assert n_grown(steps) >= 1 if pressure > 10 else kept(made[0]) <= FEW
+    assert n_grown(steps) >= 1 if pressure > 10 else n_retained_dofs(made[0]) <= FEW
     assert_same(found, full)
 
 
@@ -135,28 +135,28 @@ def test_two_bodies(update):
     The pairs are those of the undeformed bodies, or updated.
     """
     end, steps = (1.0, 2) if update == "never" else (1.5, 6)
-    made = [Shod(update_pairs=update, condensation=c, **TIGHT) for c in (None, False)]
+    made = [BlockUnderShoe(update_pairs=update, condensation=c, **TIGHT) for c in (None, False)]
     (_, found), (_, full) = (run(m, end, steps) for m in made)
-    assert kept(made[0]) <= FEW
+    assert n_retained_dofs(made[0]) <= FEW
     assert_same(found, full)
 
 
 # ---- spreading contact ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("wanted", [None, True])
+@pytest.mark.parametrize("condensation", [None, True])
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_contact_moves_beyond_the_retained_dofs(cell, wanted):
+def test_contact_moves_beyond_the_retained_dofs(cell, condensation):
     """Contact leaves the retained dofs: others are retained, or more, and results agree.
 
     More are retained if condensation is requested.
     """
-    made = [Pressed(cell=cell, condensation=c, **TIGHT) for c in (wanted, False)]
+    made = [IndentedBlock(cell=cell, condensation=c, **TIGHT) for c in (condensation, False)]
     (steps, found), (_, full) = (run(m, 3.5, 7) for m in made)
     assert 1 <= n_grown(steps) <= 2
     assert sum(step.factorisations for step in steps) == 1 + n_grown(steps)
-    if wanted is None:
-        assert kept(made[0]) <= FEW
+    if condensation is None:
+        assert n_retained_dofs(made[0]) <= FEW
     assert_same(found, full)
 
 
@@ -164,7 +164,7 @@ def test_contact_moves_beyond_the_retained_dofs(cell, wanted):
 def test_two_bodies_pressed_deep():
     """Results agree as the contact of the shoe grows wider than the dofs retained at first."""
     made = [
-        Shod(deep=0.05, condensation=c, small_displacement_tolerance=np.inf, **TIGHT)
+        BlockUnderShoe(depth=0.05, condensation=c, small_displacement_tolerance=np.inf, **TIGHT)
         for c in (True, False)
     ]
     (steps, found), (_, full) = (run(m, 1.0, 5) for m in made)
@@ -172,21 +172,21 @@ def test_two_bodies_pressed_deep():
     assert_same(found, full)
 
 
-@pytest.mark.parametrize("wanted", [None, True])
-def test_pressed_deep(wanted):
+@pytest.mark.parametrize("condensation", [None, True])
+def test_pressed_deep(condensation):
     """Most of the top comes into contact: results agree.
 
     From then on all dofs are used, or all coupled dofs are retained if condensation is requested.
     """
     made = [
-        Pressed(deep=0.12, condensation=c, small_displacement_tolerance=np.inf, **TIGHT)
-        for c in (wanted, False)
+        IndentedBlock(depth=0.12, condensation=c, small_displacement_tolerance=np.inf, **TIGHT)
+        for c in (condensation, False)
     ]
     (steps, found), (_, full) = (run(m, 1.0, 10) for m in made)
     assert steps[0].attempts[-1].outcome == "converged"
     assert n_grown(steps) >= 1
-    if wanted:
-        assert kept(made[0]) > 1.5 * FEW
+    if condensation:
+        assert n_retained_dofs(made[0]) > 1.5 * FEW
     else:
         assert not made[0].problem.solver.condensed
     assert_same(found, full)
@@ -194,7 +194,7 @@ def test_pressed_deep(wanted):
 
 def test_recovering_only_the_last_interior_displacement():
     """Results do not change, serially bit for bit: no point closes undetected."""
-    made = [Pressed(condensation=True) for _ in range(2)]
+    made = [IndentedBlock(condensation=True) for _ in range(2)]
     (steps, found), (others, every) = (
         run(m, 3.0, 6, recover_interior=field)
         for m, field in zip(made, ("last", "every"), strict=True)
@@ -206,25 +206,25 @@ def test_recovering_only_the_last_interior_displacement():
         size = abs(other.energy.work) + abs(other.energy.elastic)
         for name in ("work", "elastic", "springs", "dissipation"):
             ours, theirs = getattr(one.energy, name), getattr(other.energy, name)
-            assert close(ours, theirs, SAME, scale=size), name
+            assert is_close(ours, theirs, SAME, scale=size), name
 
 
-@pytest.mark.parametrize("wanted", [None, True])
-def test_restart(wanted, tmp_path):
-    """A history restarted after more dofs are retained has the same digits (`goes_on`)."""
-    make = lambda: Pressed(condensation=wanted)  # noqa: E731
-    goes_on(make, shared_folder(tmp_path), stop=5, end=3.5)
+@pytest.mark.parametrize("condensation", [None, True])
+def test_restart(condensation, tmp_path):
+    """A history restarted after more dofs are retained has the same digits."""
+    make = lambda: IndentedBlock(condensation=condensation)  # noqa: E731
+    assert_restart_equals_uninterrupted(make, shared_folder(tmp_path), stop=5, end=3.5)
 
 
 def test_restart_on_all_dofs(tmp_path):
     """A restarted history has the same digits where contact is too wide to be condensed."""
-    make = lambda: Pressed(deep=0.12, small_displacement_tolerance=np.inf)  # noqa: E731
-    goes_on(make, shared_folder(tmp_path), stop=4, end=1.0, steps=5)
+    make = lambda: IndentedBlock(depth=0.12, small_displacement_tolerance=np.inf)  # noqa: E731
+    assert_restart_equals_uninterrupted(make, shared_folder(tmp_path), stop=4, end=1.0, steps=5)
 
 
 def test_failed_increment_has_no_effect():
     """A failed increment changes neither u nor history nor the next increment (1e-9)."""
-    made, twin = (Pressed(condensation=True, fallback=False) for _ in range(2))
+    made, twin = (IndentedBlock(condensation=True, fallback=False) for _ in range(2))
     for m in (made, twin):
         run(m, 1.0)
     before = made.u.x.array.copy()
@@ -240,17 +240,17 @@ def test_failed_increment_has_no_effect():
         m.load(1.5)
         m.problem.solve()
         m.problem.commit()
-        results.append({"u": nodal(m.u)})
+        results.append({"u": nodal_values(m.u)})
     assert_same(*results, rtol=1e-9)
 
 
 def test_units():
     """Retained dofs, effort and digits are the same in other units, to 1e-9 of the field."""
-    made = [Pressed(length=length) for length in (1.0, 1e-3)]
+    made = [IndentedBlock(length=length) for length in (1.0, 1e-3)]
     (one, a), (other, b) = (run(m, 2.0, 4) for m in made)
-    assert kept(made[0]) == kept(made[1])
-    assert same_effort([s.iterations for s in one], [s.iterations for s in other])
-    assert close(b["u"] / 1e-3, a["u"], 1e-9)
+    assert n_retained_dofs(made[0]) == n_retained_dofs(made[1])
+    assert have_similar_iterations([s.iterations for s in one], [s.iterations for s in other])
+    assert is_close(b["u"] / 1e-3, a["u"], 1e-9)
 
 
 # ---- selection of candidates ---------------------------------------------------------------------
@@ -266,22 +266,22 @@ def test_candidates_on_the_whole_surface(caplog):
     for law, contact in everywhere.values():
         caplog.clear()
         with caplog.at_level(logging.INFO, logger="fenics_contact"):
-            made = Pressed(law, contact=contact)
+            made = IndentedBlock(law, contact=contact)
         assert not made.problem.solver.condensed
         if COMM.rank == 0:
             said = [record.getMessage() for record in caplog.records]
             assert any("contact couples 1042 of" in text for text in said)
-        forced = Pressed(law, contact=contact, condensation=True)
-        assert kept(forced) == 2 * (CELLS["quadrilateral"][0] + 1)
+        forced = IndentedBlock(law, contact=contact, condensation=True)
+        assert n_retained_dofs(forced) == 2 * (CELLS["quadrilateral"][0] + 1)
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_any_number_of_ranks(cell):
     """Retained dofs, their growth, effort and forces are those on one rank."""
-    made, alone = (Pressed(cell=cell, comm=comm, **TIGHT) for comm in (COMM, MPI.COMM_SELF))
+    made, alone = (IndentedBlock(cell=cell, comm=comm, **TIGHT) for comm in (COMM, MPI.COMM_SELF))
     (steps, found), (serial, expected) = (run(m, 3.0, 6) for m in (made, alone))
-    assert kept(made) == kept(alone)
-    assert same_effort([s.iterations for s in steps], [s.iterations for s in serial])
+    assert n_retained_dofs(made) == n_retained_dofs(alone)
+    assert have_similar_iterations([s.iterations for s in steps], [s.iterations for s in serial])
     assert n_grown(steps) == n_grown(serial)
     for name in ("forces", "counts"):
-        assert close(found[name], expected[name], SAME), name
+        assert is_close(found[name], expected[name], SAME), name

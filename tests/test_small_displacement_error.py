@@ -16,7 +16,7 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.checks.kinematics import spring_stiffness
 from scenes.blocks import BOTTOM, TOP, Block, block, block_mesh
-from scenes.comparing import at_points, close
+from scenes.comparison import is_close, point_values
 from scenes.elasticity import displacement_space, stress
 
 COMM = MPI.COMM_WORLD
@@ -36,9 +36,9 @@ def pressed(
     motion = np.zeros(d)
     motion[0] = obstacle
     ball = fc.Ball(center, RADIUS, displacement=motion)
-    bcs = [scene.hold(TOP, d - 1, -DEPTH), scene.hold(TOP, 0, body)]
+    bcs = [scene.dirichlet_bc(TOP, d - 1, -DEPTH), scene.dirichlet_bc(TOP, 0, body)]
     if d == 3:
-        bcs.append(scene.hold(TOP, 1))
+        bcs.append(scene.dirichlet_bc(TOP, 1))
     problem, contact = scene.problem(
         fc.Frictionless(),
         bcs,
@@ -58,25 +58,27 @@ def solved(**scene):
 
 
 @pytest.mark.parametrize("options", [{}, {"condensation": False, "method": "lbfgs"}])
-@pytest.mark.parametrize("way", [0.05, 0.2])
-def test_estimate_is_the_difference_to_the_dragged_obstacle(way, options):
+@pytest.mark.parametrize("displacement", [0.05, 0.2])
+def test_estimate_is_the_difference_to_the_dragged_obstacle(displacement, options):
     """The estimate agrees with the difference to the dragged obstacle within a factor of two."""
-    told, dragged = solved(body=-way, **options)
-    nearly, exact = solved(obstacle=way, **options)
+    with_dragged_body, dragged = solved(body=-displacement, **options)
+    nearly, exact = solved(obstacle=displacement, **options)
     missing = np.abs(dragged - exact).max() / np.linalg.norm(dragged)
-    small = max(nearly.worst, told.force / 5)
-    assert 0.5 * (missing - small) <= told.force <= 2 * (missing + small)
+    small = max(nearly.worst, with_dragged_body.force / 5)
+    assert 0.5 * (missing - small) <= with_dragged_body.force <= 2 * (missing + small)
     assert missing > 0.005
 
 
 def test_plane_has_no_small_displacement_error():
     """A body may slide far along a plane: the error is at most 1e-12."""
     scene = block("quadrilateral", n=4, up=-10.0)
-    problem, contact = scene.problem(fc.Coulomb(0.1), [scene.hold(TOP, 0, 30.0)])
+    problem, contact = scene.problem(fc.Coulomb(0.1), [scene.dirichlet_bc(TOP, 0, 30.0)])
     step = problem.solve()
     assert step.verdict.small_displacement_error["contact"].worst <= 1e-12
     _, normal = contact.true_placement()
-    assert close(at_points(contact, normal), at_points(contact, contact.values.normal), 1e-14)
+    assert is_close(
+        point_values(contact, normal), point_values(contact, contact.values.normal), 1e-14
+    )
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
@@ -92,15 +94,17 @@ def test_gap_and_normal_at_the_deformed_position(cell):
     x = contact.points
     arm = x + np.stack([0.1 + 0.05 * x[:, 0] - 0.02 * x[:, i] for i in range(d)], axis=1) - center
     length = np.linalg.norm(arm, axis=1)
-    assert close(at_points(contact, gap), at_points(contact, length - RADIUS), 1e-12)
-    assert close(at_points(contact, normal), at_points(contact, -arm / length[:, None]), 1e-12)
+    assert is_close(point_values(contact, gap), point_values(contact, length - RADIUS), 1e-12)
+    assert is_close(
+        point_values(contact, normal), point_values(contact, -arm / length[:, None]), 1e-12
+    )
 
 
 def test_large_displacement_fails():
     problem, contact = pressed(body=-1.0, small_displacement_tolerance=0.2)
     with pytest.raises(fc.NotConverged, match="too large for the small-displacement"):
         problem.solve()
-    assert close(contact.history.rows(), 0 * contact.history.rows(), 0.0, scale=1.0)
+    assert is_close(contact.history.rows(), 0 * contact.history.rows(), 0.0, scale=1.0)
 
 
 @pytest.mark.parametrize("condensation", [None, False])
@@ -112,7 +116,7 @@ def test_deformation_by_a_stiffness_in_wrong_units_fails(condensation):
 
     def pushed(E, top=0.0, **options):
         scene = block("quadrilateral", n=4, E=E, up=-1.0)
-        bcs = [scene.hold(TOP, 0, fem.Constant(scene.mesh, top))]
+        bcs = [scene.dirichlet_bc(TOP, 0, fem.Constant(scene.mesh, top))]
         problem, _ = scene.problem(fc.Frictionless(), bcs, condensation=condensation, **options)
         return problem.solve()
 
@@ -129,16 +133,16 @@ def test_small_displacement_warning_is_repeated_at_each_doubling():
         step = problem.solve()
     problem.commit()
     assert len(caught) == 1
-    told = str(caught[0].message).split("deformed position ")[1].split(". With")[0]
-    assert told in step.summary() and told in step._repr_html_()
+    with_dragged_body = str(caught[0].message).split("deformed position ")[1].split(". With")[0]
+    assert with_dragged_body in step.summary() and with_dragged_body in step._repr_html_()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         problem.solve()
     first = step.verdict.small_displacement_error["contact"].worst
     moved, said, shares = fem.Constant(problem.u.function_space.mesh, 0.0), [], []
     problem, _ = pressed(body=moved, small_displacement_tolerance=np.inf)
-    for way in np.linspace(0.0, -0.4, 9):
-        moved.value = way
+    for displacement in np.linspace(0.0, -0.4, 9):
+        moved.value = displacement
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             step = problem.solve()
@@ -146,7 +150,9 @@ def test_small_displacement_warning_is_repeated_at_each_doubling():
         said.append(any("assumed small" in str(w.message) for w in caught))
         shares.append(step.verdict.small_displacement_error["contact"].worst)
         assert ("assumed small" in step.summary()) == (shares[-1] > 0.01)
-    warned = [share for share, told in zip(shares, said, strict=True) if told]
+    warned = [
+        share for share, with_dragged_body in zip(shares, said, strict=True) if with_dragged_body
+    ]
     assert len(warned) > 2 and warned[-1] > first
     assert all(b > 2 * a for a, b in pairwise(warned))
     assert max(shares) <= 2 * warned[-1]
@@ -188,9 +194,9 @@ def test_estimates_are_invariant_under_rotation(angle):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             step = problem.solve()
-        told = step.verdict.small_displacement_error["contact"]
+        with_dragged_body = step.verdict.small_displacement_error["contact"]
         budget = fc.estimate_errors(problem, stress(scene.u, scene.E, scene.nu))
-        found.append([told.force, told.pressure])
+        found.append([with_dragged_body.force, with_dragged_body.pressure])
         found[-1] += [budget.values["displacement"], budget.parts["kinematics"]["displacement"]]
     assert min(found[0][:2]) > 0.01
     assert found[1] == pytest.approx(found[0], rel=1e-5)
@@ -199,25 +205,25 @@ def test_estimates_are_invariant_under_rotation(angle):
 # ---- an obstacle whose displacement varies along Γc ----------------------------------------------
 
 
-def tilted(angle, how):
+def tilted(angle, formulation):
     """Return error and force of a block fixed at its top and a floor tilted by a displacement."""
     scene = block("quadrilateral", n=8)
     x = ufl.SpatialCoordinate(scene.mesh)
     floor = fc.HalfSpace((0.5, 0.02), (-np.sin(angle), np.cos(angle)))
-    if how != "plane":
+    if formulation != "plane":
         space = scene.u.function_space
-        if how == "function on Γc":
+        if formulation == "function on Γc":
             space = fem.functionspace(scene.surface.submesh, ("Lagrange", 1, (2,)))
         motion = fem.Function(space)
         motion.interpolate(lambda x: np.stack([-angle * x[1], 0.02 + angle * (x[0] - 0.5)]))
-        if how == "expression":
+        if formulation == "expression":
             motion = ufl.as_vector([-angle * x[1], 0.02 + angle * (x[0] - 0.5)])
         floor = fc.HalfSpace((0.5, 0.0), (0.0, 1.0), displacement=motion)
-        if how == "profile":
+        if formulation == "profile":
             line = np.linspace(-2.0, 3.0, 21)
             points = np.stack([line, np.zeros_like(line)], axis=1)
             floor = fc.RigidProfile(points[::-1], displacement=motion)
-    bcs = [scene.hold(TOP, 0), scene.hold(TOP, 1)]
+    bcs = [scene.dirichlet_bc(TOP, 0), scene.dirichlet_bc(TOP, 1)]
     problem, contact = scene.problem(
         fc.Frictionless(), bcs, contact={"obstacle": floor}, small_displacement_tolerance=np.inf
     )
@@ -228,22 +234,22 @@ def tilted(angle, how):
 
 
 @pytest.mark.each
-@pytest.mark.parametrize("how", ["expression", "function", "function on Γc", "profile"])
-def test_error_of_a_plane_tilted_by_its_displacement(how):
+@pytest.mark.parametrize("formulation", ["expression", "function", "function on Γc", "profile"])
+def test_error_of_a_plane_tilted_by_its_displacement(formulation):
     """The estimate is the relative difference e to the tilted plane; zero if only shifted.
 
     It agrees within the larger of e/10 and e², at most 2 e²: second-order terms are neglected.
     """
     for angle in (0.03, 0.1):
-        told, force = tilted(angle, how)
+        with_dragged_body, force = tilted(angle, formulation)
         exact, reference = tilted(angle, "plane")
         assert exact.worst == 0.0
         missing = np.linalg.norm(force - reference) / np.linalg.norm(force)
-        assert told.force == pytest.approx(
+        assert with_dragged_body.force == pytest.approx(
             missing, abs=min(max(0.1 * missing, missing**2), 2 * missing**2)
         )
-    told, _ = tilted(0.0, how)
-    assert told.worst <= 1e-3
+    with_dragged_body, _ = tilted(0.0, formulation)
+    assert with_dragged_body.worst <= 1e-3
 
 
 def test_small_displacement_gives_no_warning():
@@ -279,8 +285,8 @@ def test_error_budget_includes_the_small_displacement_error():
     problem, dragged = solved(body=-0.1)
     _, exact = solved(obstacle=0.1)
     plane = stress(problem.u, 1000.0, 0.3)
-    told = fc.estimate_errors(problem, plane).parts["kinematics"]["normal force"]
-    assert close(told, dragged - exact, 1 / 3)
+    with_dragged_body = fc.estimate_errors(problem, plane).parts["kinematics"]["normal force"]
+    assert is_close(with_dragged_body, dragged - exact, 1 / 3)
     assert abs(dragged - exact) > 1e-3 * exact
 
 
@@ -299,7 +305,7 @@ def test_estimate_includes_tangential_stiffness_of_slip(transverse, cell, enforc
     shift = fem.Constant(scene.mesh, np.zeros(d))
     options = {"transverse_friction": transverse, "direction": np.eye(d)[0]} if transverse else {}
     law = fc.Coulomb(0.3, 1e4, 1e3, **options)
-    bcs = [scene.hold(TOP, i, -0.01 if i == d - 1 else 0.0) for i in range(d)]
+    bcs = [scene.dirichlet_bc(TOP, i, -0.01 if i == d - 1 else 0.0) for i in range(d)]
     given = {"displacement": shift, "enforcement": enforcement}
     problem, contact = scene.problem(law, bcs, contact=given)
     problem.solve()

@@ -25,12 +25,12 @@ from fenics_contact.types import Array
 # ---- assembly ------------------------------------------------------------------------------------
 
 
-def compiled(form: ufl.Form, contact: fc.Contact | None = None) -> fem.Form:
+def compile_with_maps(form: ufl.Form, contact: fc.Contact | None = None) -> fem.Form:
     """Return the compiled form, with the entity maps of the forms of the contact."""
     return compile_form(form, contact.entity_maps if contact else None)
 
 
-def assemble_number(form: fem.Form, comm: MPI.Comm) -> float:
+def assemble_scalar(form: fem.Form, comm: MPI.Comm) -> float:
     """Return the integral of a form without arguments, summed over all ranks."""
     return comm.allreduce(fem.assemble_scalar(form))
 
@@ -40,7 +40,7 @@ def assemble_owned(form: fem.Form, space: fem.FunctionSpace) -> Array:
     f = fem.Function(space)
     fem.assemble_vector(f.x.array, form)
     f.x.scatter_reverse(dolfinx.la.InsertMode.add)
-    return owned(f).copy()
+    return owned_values(f).copy()
 
 
 def assemble_matrix(form: fem.Form) -> PETSc.Mat:
@@ -51,7 +51,7 @@ def assemble_matrix(form: fem.Form) -> PETSc.Mat:
     return matrix
 
 
-def owned(f: fem.Function) -> Array:
+def owned_values(f: fem.Function) -> Array:
     """Return a view of the values at this rank's owned dofs."""
     dofmap = f.function_space.dofmap
     return f.x.array[: dofmap.index_map.size_local * dofmap.index_map_bs]
@@ -59,7 +59,7 @@ def owned(f: fem.Function) -> Array:
 
 def set_owned(f: fem.Function, values: Array) -> None:
     """Set the values at the owned dofs, and update the ghosts."""
-    owned(f)[:] = values
+    owned_values(f)[:] = values
     f.x.scatter_forward()
 
 
@@ -71,12 +71,12 @@ def shared_folder(tmp_path: Path) -> Path:
 # ---- comparisons ---------------------------------------------------------------------------------
 
 
-def gathered(comm: MPI.Comm, rows: Array) -> Array:
+def gather(comm: MPI.Comm, rows: Array) -> Array:
     """Return the rows of all ranks, on all ranks."""
     return np.concatenate(comm.allgather(np.asarray(rows)), axis=0)
 
 
-def sorted_by_place(places: Array, *columns: Array) -> Array:
+def sort_by_coordinates(places: Array, *columns: Array) -> Array:
     """Return rows (coordinates, columns) sorted by coordinates rounded to 1e-9 of the largest.
 
     Results on equal meshes with different distributions become comparable.
@@ -86,24 +86,24 @@ def sorted_by_place(places: Array, *columns: Array) -> Array:
     return np.column_stack([places, *columns])[order]
 
 
-def nodal(u: fem.Function) -> Array:
+def nodal_values(u: fem.Function) -> Array:
     """Return values (all nodes, bs) of all ranks, sorted by the coordinates of the nodes."""
     space = u.function_space
     d, bs = space.mesh.geometry.dim, space.dofmap.index_map_bs
     n = space.dofmap.index_map.size_local
     x, values = space.tabulate_dof_coordinates()[:n, :d], u.x.array.reshape(-1, bs)[:n]
     comm = space.mesh.comm
-    return sorted_by_place(gathered(comm, x), gathered(comm, values))[:, d:]
+    return sort_by_coordinates(gather(comm, x), gather(comm, values))[:, d:]
 
 
-def at_points(contact: fc.Contact, rows: Array) -> Array:
+def point_values(contact: fc.Contact, rows: Array) -> Array:
     """Return rows (points, …) of all ranks, sorted by the coordinates of the points."""
     comm = contact.surface.mesh.comm
     d = contact.points.shape[1]
-    return sorted_by_place(gathered(comm, contact.points), gathered(comm, rows))[:, d:]
+    return sort_by_coordinates(gather(comm, contact.points), gather(comm, rows))[:, d:]
 
 
-def close(actual: Any, expected: Any, rtol: float, *, scale: float | None = None) -> bool:
+def is_close(actual: Any, expected: Any, rtol: float, *, scale: float | None = None) -> bool:
     """Return whether differences are within ``rtol`` of the largest expected entry or ``scale``."""
     actual, expected = np.asarray(actual, dtype=float), np.asarray(expected, dtype=float)
     assert actual.shape == expected.shape
@@ -117,13 +117,13 @@ def close(actual: Any, expected: Any, rtol: float, *, scale: float | None = None
     return True
 
 
-def identical(a: Iterable[Array], b: Iterable[Array]) -> bool:
+def are_identical(a: Iterable[Array], b: Iterable[Array]) -> bool:
     """Return whether the arrays are equal bit for bit on all ranks."""
     same = all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
     return bool(np.all(MPI.COMM_WORLD.allgather(same)))
 
 
-def on_first(check: Callable[[], None]) -> None:
+def check_on_first_rank(check: Callable[[], None]) -> None:
     """Run a check on the first rank; if it fails, fail on all ranks. Collective."""
     error, comm = None, MPI.COMM_WORLD
     if comm.rank == 0:
@@ -134,7 +134,7 @@ def on_first(check: Callable[[], None]) -> None:
     assert comm.bcast(error) is None
 
 
-def raised_everywhere(
+def assert_raised_on_all_ranks(
     call: Callable[[], Any],
     kind: type[Exception] | tuple[type[Exception], ...],
     *words: str,
@@ -156,17 +156,19 @@ def raised_everywhere(
     return reports[0][1]
 
 
-def same_field(
+def is_interpolant(
     f: fem.Function, expected: Callable[[Array], Array], rtol: float, *, scale: float | None = None
 ) -> bool:
     """Return whether ``f`` is the interpolant of ``expected``, compared on all ranks."""
     reference = fem.Function(f.function_space)
     reference.interpolate(expected)
     comm = f.function_space.mesh.comm
-    return close(gathered(comm, owned(f)), gathered(comm, owned(reference)), rtol, scale=scale)
+    return is_close(
+        gather(comm, owned_values(f)), gather(comm, owned_values(reference)), rtol, scale=scale
+    )
 
 
-def same_effort(iterations: Sequence[int], others: Sequence[int]) -> bool:
+def have_similar_iterations(iterations: Sequence[int], others: Sequence[int]) -> bool:
     """Return whether the iterations of every increment differ by at most one.
 
     Round-off decides whether a last iteration is needed. Other causes, such as a setting of the

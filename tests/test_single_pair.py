@@ -11,9 +11,21 @@ from dolfinx import fem
 
 import fenics_contact as fc
 from scenes.bodies import Bodies, boxes
-from scenes.comparing import close
-from scenes.stacks import FLOOR, LOWER, ROOF, SIDES, UPPER, E, balance, joint, rings, stack, uniform
-from scenes.tags import between, near
+from scenes.comparison import is_close
+from scenes.stacks import (
+    FLOOR,
+    LOWER,
+    ROOF,
+    SIDES,
+    UPPER,
+    E,
+    force_resultants,
+    is_uniform,
+    joint,
+    rings,
+    stack,
+)
+from scenes.tags import at_coordinate, at_interface
 
 pytestmark = pytest.mark.three_ranks
 
@@ -35,7 +47,7 @@ def slit_ring(*, half, degree):
         offset = 0.01 * (1 - x[:, 0] / np.pi)
         return np.column_stack([x[:, 1] * np.cos(x[:, 0]), x[:, 1] * np.sin(x[:, 0]) + offset])
 
-    sides = {FLOOR: near(0, 0), ROOF: near(0, end), SIDES: near(1, 1.5)}
+    sides = {FLOOR: at_coordinate(0, 0), ROOF: at_coordinate(0, end), SIDES: at_coordinate(1, 1.5)}
     body = Bodies(boxes(axes, sides, bend=bend, degree=2), E, 0.3, degree=degree)
     space = body.u.function_space
     cut = fem.locate_dofs_geometrical(space, lambda x: (x[0] < 0) & (np.abs(x[1]) < 1e-9))
@@ -66,11 +78,11 @@ def test_self_contact_of_a_slit_ring_equals_its_half_on_a_plane(degree):
         made.append(contact)
         first.append(few.contacts["contact"].force)
     ring, half = made
-    assert close(*first, 1e-7) and first[0][1] > 100.0
-    assert close(ring.gather()["pressure"], half.gather()["pressure"], 1e-6)
-    assert close(ring.resultants().force, half.resultants().force, 1e-7)
+    assert is_close(*first, 1e-7) and first[0][1] > 100.0
+    assert is_close(ring.gather()["pressure"], half.gather()["pressure"], 1e-6)
+    assert is_close(ring.resultants().force, half.resultants().force, 1e-7)
     assert ring.resultants().tangential_force <= 1e-6 * ring.resultants().normal_force
-    total, _, size = balance(ring)
+    total, _, size = force_resultants(ring)
     assert np.abs(total).max() <= 1e-12 * size
 
 
@@ -84,9 +96,9 @@ def test_interference_has_the_closed_form_pressure(cell):
     body = stack(cell, (3, 5), (0.5, 0.5))
     up = body.d - 1
     away = body.constant(0.0)
-    body.hold(FLOOR, up)
-    body.hold(ROOF, up, value=away)
-    body.hold(SIDES, *range(up))
+    body.prescribe(FLOOR, up)
+    body.prescribe(ROOF, up, value=away)
+    body.prescribe(SIDES, *range(up))
     contact = joint(body, 1, fc.Frictionless(k_n), gap=-oversize)
     problem = body.problem(contact)
     assert problem.initial_penetration == 0.0
@@ -94,11 +106,11 @@ def test_interference_has_the_closed_form_pressure(cell):
         away.value = opening
         problem.solve()
         problem.commit()
-        assert uniform(contact.pressure, (oversize - opening) / (1 / E + 1 / k_n), 1e-8)
+        assert is_uniform(contact.pressure, (oversize - opening) / (1 / E + 1 / k_n), 1e-8)
     away.value = 0.015
     problem.solve()
     assert contact.resultants().normal_force == 0.0
-    assert uniform(contact.gap, 0.005, 1e-8)
+    assert is_uniform(contact.gap, 0.005, 1e-8)
 
 
 def test_interference_that_varies_along_the_joint():
@@ -107,7 +119,7 @@ def test_interference_that_varies_along_the_joint():
     contact = joint(body, 1, fc.Frictionless(1e7), gap=-0.01 * body.x[0])
     contact.evaluate()
     points = contact.gather()
-    assert close(points["pressure"], 1e5 * points["x"][:, 0], 1e-12)
+    assert is_close(points["pressure"], 1e5 * points["x"][:, 0], 1e-12)
 
 
 # ---- very different meshes -----------------------------------------------------------------------
@@ -128,16 +140,16 @@ def test_patch_of_very_different_cells(counts, cell, degree, swap):
     """Pressure is uniform, to 1e-8, for one cell opposite to 20 and for nearly matching cells."""
     nu, k_n = 0.3, 1e7
     body = stack(cell, counts, (0.05, 0.05), degree=degree, nu=nu)
-    body.hold(FLOOR, body.d - 1)
-    body.hold(ROOF, body.d - 1, value=-0.001)
-    body.hold(SIDES, *range(body.d - 1))
+    body.prescribe(FLOOR, body.d - 1)
+    body.prescribe(ROOF, body.d - 1, value=-0.001)
+    body.prescribe(SIDES, *range(body.d - 1))
     contact = joint(body, 1, fc.Coulomb(0.3, k_n=k_n, k_t=k_n), swap=swap)
     body.problem(contact).solve()
     confined = E * (1 - nu) / ((1 + nu) * (1 - 2 * nu))
     p = 0.001 / (0.1 / confined + 1 / k_n)
     assert contact.n_unpaired == 0
-    assert uniform(contact.pressure, p, 1e-8)
-    assert uniform(contact.gap, -p / k_n, 1e-8)
+    assert is_uniform(contact.pressure, p, 1e-8)
+    assert is_uniform(contact.gap, -p / k_n, 1e-8)
 
 
 # ---- action and reaction -------------------------------------------------------------------------
@@ -148,7 +160,7 @@ def test_patch_of_very_different_cells(counts, cell, degree, swap):
 def test_moment_of_tractions_across_a_gap(cell, swap):
     """Forces on faces 0.02 apart cancel; their moment is the shear force times 0.02, to 1e-10."""
     gap = 0.02
-    body = stack(cell, (3, 5), (0.5, 0.5), apart=gap)
+    body = stack(cell, (3, 5), (0.5, 0.5), gap=gap)
     contact = joint(body, 1, fc.Coulomb(0.3, k_n=1e6, k_t=1e6), swap=swap)
     up = body.d - 1
     # The upper block is moved down by more than the gap, and sideways.
@@ -164,12 +176,12 @@ def test_moment_of_tractions_across_a_gap(cell, swap):
     contact.evaluate()
     r = contact.resultants()
     assert r.slip > 0 and r.normal_force > 0
-    total, moment, size = balance(contact)
+    total, moment, size = force_resultants(contact)
     assert np.abs(total).max() <= 1e-12 * size
     assert abs(r.force[0]) > 0.05 * size / 2
     # The shear forces on both bodies are opposite, at the distance of the gap.
     sign = 1 if swap else -1
-    assert close(moment, sign * gap * r.force[0], 1e-10, scale=size * gap)
+    assert is_close(moment, sign * gap * r.force[0], 1e-10, scale=size * gap)
 
 
 def inner(x):
@@ -189,14 +201,14 @@ def test_torque_of_a_ring_rotated_in_a_ring(counts):
     body = rings(counts, angle=angle)
     contact = body.contact(LOWER, UPPER, law, gap=-oversize)
     assert contact.n_unpaired == 0
-    body.displace(lambda x: 0.01 * np.vstack([-x[1], x[0]]), inner)
+    body.set_displacement(lambda x: 0.01 * np.vstack([-x[1], x[0]]), inner)
     contact.evaluate()
     r, points = contact.resultants(), contact.gather()
     assert r.stick == r.open == 0
-    assert close(r.normal_force, k_n * oversize * 20 * angle, 1e-5)
+    assert is_close(r.normal_force, k_n * oversize * 20 * angle, 1e-5)
     x, t = points["x"], points["tangential_traction"]
     torque = points["measure"] @ (x[:, 0] * t[:, 1] - x[:, 1] * t[:, 0])
-    assert close(torque, -friction * r.normal_force * 20, 1e-5)
+    assert is_close(torque, -friction * r.normal_force * 20, 1e-5)
 
 
 def test_moments_of_curved_surfaces_cancel_as_the_meshes_are_refined():
@@ -205,9 +217,9 @@ def test_moments_of_curved_surfaces_cancel_as_the_meshes_are_refined():
     for counts in ((4, 7), (8, 14), (16, 28)):
         body = rings(counts)
         contact = body.contact(LOWER, UPPER, fc.Coulomb(0.2, k_n=1e5, k_t=1e6), gap=-0.01)
-        body.displace(lambda x: 0.005 * np.sin(np.vstack([x[0] / 5, x[1] / 7])), inner)
+        body.set_displacement(lambda x: 0.005 * np.sin(np.vstack([x[0] / 5, x[1] / 7])), inner)
         contact.evaluate()
-        total, moment, size = balance(contact)
+        total, moment, size = force_resultants(contact)
         assert np.abs(total).max() <= 1e-12 * size
         errors.append(abs(moment) / (20 * size))
     assert errors[0] <= 1e-6
@@ -226,7 +238,7 @@ def test_points_of_an_overhang_are_unpaired(cell):
     q = 1e3
     body = stack(cell, (5, 8), (0.5, 0.25), widths=[0.6, 1.0], nu=0.3)
     up = body.d - 1
-    body.hold(FLOOR, *range(body.d))
+    body.prescribe(FLOOR, *range(body.d))
     body.F += q * body.v[up] * body.ds(ROOF)
     contact = joint(body, 1, fc.Coulomb(0.5, k_n=1e7, k_t=1e7))
     points = contact.gather()
@@ -237,12 +249,12 @@ def test_points_of_an_overhang_are_unpaired(cell):
     points = contact.gather()
     assert np.all(points["status"][outside] == fc.Status.OPEN)
     assert np.all(points["pressure"][outside] == 0.0)
-    assert close(contact.resultants().force, q * np.eye(body.d)[-1], 1e-8)
-    total, moment, size = balance(contact)
+    assert is_close(contact.resultants().force, q * np.eye(body.d)[-1], 1e-8)
+    total, moment, size = force_resultants(contact)
     assert np.abs(total).max() <= 1e-12 * size
     assert abs(moment) <= 1e-12 * size
     middle = points["measure"] * points["pressure"] @ points["x"][:, 0]
-    assert close(middle, 0.5 * q, 1e-8)
+    assert is_close(middle, 0.5 * q, 1e-8)
 
 
 def test_contact_without_opposite_points_has_no_force():
@@ -251,11 +263,11 @@ def test_contact_without_opposite_points_has_no_force():
         [np.linspace(0, 1, 4), np.linspace(0, 1, 4)],
         [np.linspace(2, 3, 4), np.linspace(1, 2, 4)],
     ]
-    sides = {LOWER: between(1, 1, above=False), UPPER: between(1, 1, above=True)}
+    sides = {LOWER: at_interface(1, 1, above=False), UPPER: at_interface(1, 1, above=True)}
     body = Bodies(boxes(axes, sides), E, 0.3)
     contact = body.contact(UPPER, LOWER, fc.Frictionless(1e6))
     body.u.interpolate(lambda x: 0.1 * np.sin([3 * x[0] + 5 * x[1] + i for i in range(2)]))
     contact.evaluate()
     assert contact.n_unpaired == len(contact.gather()["x"]) > 0
     assert contact.resultants().normal_force == 0.0
-    assert balance(contact)[2] == 0.0
+    assert force_resultants(contact)[2] == 0.0

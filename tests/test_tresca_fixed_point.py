@@ -10,9 +10,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fenics_contact as fc
-from scenes.blocks import GRID, TOP, block, wave
-from scenes.comparing import at_points, close, nodal, owned
-from scenes.rubbing import Rub, cushion, pressed
+from scenes.block_on_ball import BlockOnBall, loaded_block, supporting_ball
+from scenes.blocks import GRID, TOP, block, rough_field
+from scenes.comparison import is_close, nodal_values, owned_values, point_values
 
 pytestmark = pytest.mark.two_ranks
 
@@ -25,15 +25,15 @@ def test_solution_equals_that_of_newton(cell, degree):
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
     states = []
     for method in ("alternating", "newton"):
-        scene, problem, contact = pressed(cell, law, method, degree=degree, n=3, side=0.06)
+        scene, problem, contact = loaded_block(cell, law, method, degree=degree, n=3, side=0.06)
         step = problem.solve()
         assert step.method == method
         r = step.contacts["contact"]
         assert r.slip > 0 and not step.verdict.failures
-        states.append((nodal(scene.u), r.force))
+        states.append((nodal_values(scene.u), r.force))
         assert contact.history.values("slip").max(initial=0.0) == 0.0  # not committed
     for a, b in zip(*states, strict=True):
-        assert close(a, b, 1e-6)
+        assert is_close(a, b, 1e-6)
 
 
 @pytest.mark.whole
@@ -52,9 +52,9 @@ def test_every_law_has_the_solution_of_newton(law):
     """Forces agree to 1e-6 for laws with a potential (one minimum problem) and with friction."""
     forces = []
     for method in ("alternating", "newton"):
-        _, problem, _ = pressed("hexahedron", law, method)
+        _, problem, _ = loaded_block("hexahedron", law, method)
         forces.append(problem.solve().contacts["contact"].force)
-    assert close(*forces, 1e-6)
+    assert is_close(*forces, 1e-6)
 
 
 def test_load_cycle_has_the_same_history():
@@ -62,10 +62,10 @@ def test_load_cycle_has_the_same_history():
     ends = []
     for method in ("alternating", "lbfgs"):
         law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
-        made = Rub(law, reach=0.05, method=method)
+        made = BlockOnBall(law, amplitude=0.05, method=method)
         list(fc.increments(made.problem, made.load, 0.0, 4.0, steps=8))
-        ends.append(at_points(made.contact, made.contact.history.rows()))
-    assert close(*ends, 1e-5)
+        ends.append(point_values(made.contact, made.contact.history.rows()))
+    assert is_close(*ends, 1e-5)
 
 
 def test_block_constrained_by_friction_only():
@@ -75,7 +75,7 @@ def test_block_constrained_by_friction_only():
         scene = block("triangle", 1, n=4, up=-1.0, side=0.15)
         problem, _ = scene.problem(fc.Coulomb(0.3, k_n=1e5, k_t=1e5), [], method=method)
         forces.append(problem.solve().contacts["contact"].force)
-    assert close(*forces, 1e-6)
+    assert is_close(*forces, 1e-6)
 
 
 def test_force_driven_obstacle_has_the_motion_of_newton():
@@ -84,15 +84,15 @@ def test_force_driven_obstacle_has_the_motion_of_newton():
     for method in ("alternating", "newton"):
         scene = block("quadrilateral", 1, n=4)
         drag = fem.Constant(scene.mesh, 0.0)
-        obstacle = cushion(2, fc.Motion(force=(drag, 5.0)))
-        bcs = [scene.hold(TOP, i) for i in range(2)]
+        obstacle = supporting_ball(2, fc.Motion(force=(drag, 5.0)))
+        bcs = [scene.dirichlet_bc(TOP, i) for i in range(2)]
         law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
         problem, contact = scene.problem(law, bcs, contact={"obstacle": obstacle}, method=method)
         for drag.value in (0.0, 0.4):
             problem.solve()
             problem.commit()
         motions.append([float(c.value) for c in contact.free_motion.values()])
-    assert close(*motions, 1e-6)
+    assert is_close(*motions, 1e-6)
 
 
 @pytest.mark.parametrize("condensation", [False, None])
@@ -103,7 +103,9 @@ def test_residual_is_the_gradient_of_the_energy(cell, condensation):
     The equations are those of all dofs, or after static condensation by default.
     """
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
-    scene, problem, contact = pressed(cell, law, "newton", side=0.03, condensation=condensation)
+    scene, problem, contact = loaded_block(
+        cell, law, "newton", side=0.03, condensation=condensation
+    )
     problem.solve()
     problem.commit()
     contact.effective_law.fix_friction_bound(contact.values.friction_bound)
@@ -112,8 +114,8 @@ def test_residual_is_the_gradient_of_the_energy(cell, condensation):
     x = equations.solution.copy()
     f, y, z = x.duplicate(), x.duplicate(), x.duplicate()
     direction = fem.Function(scene.u.function_space)
-    direction.interpolate(wave(scene.dim, 3))
-    y.array[:] = np.where(space.constrained, 0.0, space.restrict(owned(direction)))
+    direction.interpolate(rough_field(scene.dim, 3))
+    y.array[:] = np.where(space.constrained, 0.0, space.restrict(owned_values(direction)))
     x.axpy(0.02, y)  # away from the solution, where slopes are not zero
     equations.residual(x, f)
     slope, step = f.dot(y), 1e-5
@@ -123,7 +125,7 @@ def test_residual_is_the_gradient_of_the_energy(cell, condensation):
         z.axpy(sign * step, y)
         energies.append(equations.energy(z))
     assert slope != 0.0
-    assert close((energies[0] - energies[1]) / (2 * step), slope, 1e-6)
+    assert is_close((energies[0] - energies[1]) / (2 * step), slope, 1e-6)
     contact.effective_law.release_friction_bound()
 
 
@@ -137,11 +139,11 @@ def test_stiff_contact_is_solved_in_one_increment(factor, friction):
     peaks = []
     for scaled in (fc.RelativeStiffness(1e3), fc.RelativeStiffness(factor)):
         law = fc.Coulomb(friction, scaled, scaled) if friction else fc.Frictionless(scaled)
-        _, problem, _ = pressed("quadrilateral", law, "alternating", n=8, side=0.0)
+        _, problem, _ = loaded_block("quadrilateral", law, "alternating", n=8, side=0.0)
         step = problem.solve()
         r = step.contacts["contact"]
         peaks.append(r.normal_force)
-    assert close(peaks[1], peaks[0], 1e-2)
+    assert is_close(peaks[1], peaks[0], 1e-2)
     assert r.max_penetration < 1e-1 / factor
 
 
@@ -157,7 +159,7 @@ def test_convergence_is_linear_with_a_rate_proportional_to_friction(cell, monkey
     for friction in (0.1, 0.2, 0.4):
         law = fc.Coulomb(friction, k_n=2e4, k_t=1e4)
         n = 6 if cell == "triangle" else 3
-        _, problem, contact = pressed(cell, law, "alternating", n=n, side=0.0)
+        _, problem, contact = loaded_block(cell, law, "alternating", n=n, side=0.0)
         fix, bounds = contact.effective_law.fix_friction_bound, []
 
         def note(bound, fix=fix, bounds=bounds):
@@ -181,7 +183,7 @@ def test_convergence_is_linear_with_a_rate_proportional_to_friction(cell, monkey
 def test_iteration_limit_of_the_user_prevents_the_fallback():
     """With an iteration limit by the user no other method is tried."""
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
-    _, problem, _ = pressed("triangle", law, "newton", petsc_options={"snes_max_it": 1})
+    _, problem, _ = loaded_block("triangle", law, "newton", petsc_options={"snes_max_it": 1})
     with pytest.raises(fc.NotConverged) as caught:
         problem.solve()
     assert caught.value.reason == PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT
@@ -191,7 +193,7 @@ def test_petsc_options_of_the_subproblem_solver():
     """The solver of the subproblems takes options with the prefix `alternating_`."""
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
     options = {"alternating_snes_max_it": 7}
-    _, problem, _ = pressed("triangle", law, "alternating", petsc_options=options)
+    _, problem, _ = loaded_block("triangle", law, "alternating", petsc_options=options)
     assert problem.solver.methods["alternating"].snes.getTolerances()[3] == 7
 
 
@@ -202,9 +204,11 @@ def test_nonlinear_bulk_has_the_solution_of_newton():
         scene = block("quadrilateral", 1, n=4)
         v = ufl.TestFunction(scene.u.function_space)
         scene.F += 1e4 * ufl.dot(scene.u, scene.u) * ufl.dot(scene.u, v) * ufl.dx
-        bcs = [scene.hold(TOP, 0, 0.005), scene.hold(TOP, 1, -0.03)]
+        bcs = [scene.dirichlet_bc(TOP, 0, 0.005), scene.dirichlet_bc(TOP, 1, -0.03)]
         law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
-        problem, _ = scene.problem(law, bcs, contact={"obstacle": cushion(2)}, method=method)
+        problem, _ = scene.problem(
+            law, bcs, contact={"obstacle": supporting_ball(2)}, method=method
+        )
         problem.solve()
-        ends.append(nodal(scene.u))
-    assert close(*ends, 1e-6)
+        ends.append(nodal_values(scene.u))
+    assert is_close(*ends, 1e-6)

@@ -6,7 +6,7 @@ import pytest
 import fenics_contact as fc
 from fenics_contact.methods.load_balance import unbalanced
 from scenes.blocks import block
-from scenes.comparing import raised_everywhere
+from scenes.comparison import assert_raised_on_all_ranks
 from scenes.stacks import ROOF, floor, stack
 
 pytestmark = pytest.mark.two_ranks
@@ -59,7 +59,7 @@ def test_block_below_and_above_the_friction_limit(n, above):
     if above < 1:
         problem.solve()
     else:
-        raised_everywhere(problem.solve, ValueError, "balance")
+        assert_raised_on_all_ranks(problem.solve, ValueError, "balance")
 
 
 @pytest.mark.parametrize("n", [1, 2, 4])
@@ -78,4 +78,4 @@ def test_tipping_limit_of_a_block(n):
     problem.solve()
     problem.commit()
     push.value = 1.01 * limit
-    raised_everywhere(problem.solve, ValueError, "no contact force can balance")
+    assert_raised_on_all_ranks(problem.solve, ValueError, "no contact force can balance")

@@ -20,44 +20,44 @@ import fenics_contact as fc
 from fenics_contact import compat
 from fenics_contact.elasticity import NeoHookean
 from fenics_contact.types import Array
-from scenes.meshes import mesh_of
-from scenes.tags import between, near, tagged
+from scenes.meshes import create_mesh
+from scenes.tags import at_coordinate, at_interface, tag_by_midpoints
 
 BOTTOM, TOP, LOWER, UPPER, SIDE = 1, 2, 3, 4, 5
 # Origin, size, cells along x and y, and Young's modulus of both blocks.
 BLOCKS = (((0.0, 0.0), (6.0, 2.0), (24, 8), 1000.0), ((0.6, 2.0), (2.0, 1.0), (12, 6), 2000.0))
 NU, ROUND = 0.3, 0.3
 K_N, K_T = 2e4, 2e4
-PRESSED, DRAGGED = 4, 20  # numbers of increments
-DOWN, WAY = 0.2, 1.6
+N_PRESSING, N_DRAGGING = 4, 20  # numbers of increments
+DOWN, SLIDE = 0.2, 1.6
 PATH = (
-    *((0.0, DOWN * i / PRESSED) for i in range(1, PRESSED + 1)),
-    *((WAY * i / DRAGGED, DOWN) for i in range(1, DRAGGED + 1)),
+    *((0.0, DOWN * i / N_PRESSING) for i in range(1, N_PRESSING + 1)),
+    *((SLIDE * i / N_DRAGGING, DOWN) for i in range(1, N_DRAGGING + 1)),
 )
 
 
-def rubbed_mesh(fine: int = 1) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
+def sliding_block_mesh(refinement: int = 1) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
     """Return both blocks in one mesh, and the tags of their facets. Collective.
 
     Args:
-        fine: Refinement factor of the cells of `BLOCKS`.
+        refinement: Refinement factor of the cells of `BLOCKS`.
     """
     x, cells, offset = [], [], 0
     for number, (origin, size, n, _) in enumerate(BLOCKS):
         corners = [np.array(origin), np.array(origin) + size]
-        counts = tuple(fine * k for k in n)
+        counts = tuple(refinement * k for k in n)
         block = dolfinx.mesh.create_rectangle(
             MPI.COMM_SELF, corners, counts, CellType.quadrilateral
         )
         places = block.geometry.x[:, :2].copy()
         if number:
             middle, high = origin[0] + size[0] / 2, origin[1] + size[1]
-            share = (high - places[:, 1]) / size[1]
-            places[:, 1] += ROUND * share * ((places[:, 0] - middle) / (size[0] / 2)) ** 2
+            fraction = (high - places[:, 1]) / size[1]
+            places[:, 1] += ROUND * fraction * ((places[:, 0] - middle) / (size[0] / 2)) ** 2
         x.append(places)
         cells.append(compat.geometry_dofmap(block) + offset)
         offset += len(places)
-    mesh = mesh_of("quadrilateral", np.concatenate(x), np.concatenate(cells))
+    mesh = create_mesh("quadrilateral", np.concatenate(x), np.concatenate(cells))
     low, high = BLOCKS[0][1][1], BLOCKS[0][1][1] + BLOCKS[1][1][1]
     ends = BLOCKS[1][0][0], BLOCKS[1][0][0] + BLOCKS[1][1][0]
 
@@ -66,16 +66,16 @@ def rubbed_mesh(fine: int = 1) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags
         return (cell[:, 1] > low) & ~upright & (at[:, 1] < high - 1e-9)
 
     faces = {
-        BOTTOM: near(1, 0.0),
-        TOP: near(1, high),
-        LOWER: between(1, low, above=False),
+        BOTTOM: at_coordinate(1, 0.0),
+        TOP: at_coordinate(1, high),
+        LOWER: at_interface(1, low, above=False),
         UPPER: rounded,
-        SIDE: near(0, 0.0),
+        SIDE: at_coordinate(0, 0.0),
     }
-    return mesh, tagged(mesh, faces)
+    return mesh, tag_by_midpoints(mesh, faces)
 
 
-class Rubbed:
+class SlidingRubberBlock:
     """The two blocks and the contact between them.
 
     Attributes:
@@ -86,14 +86,14 @@ class Rubbed:
         tags: Facet tags.
     """
 
-    def __init__(self, friction: float, fine: int = 1) -> None:
+    def __init__(self, friction: float, refinement: int = 1) -> None:
         """Create the blocks and the contact. Collective.
 
         Args:
             friction: Friction coefficient μ; 0: frictionless.
-            fine: Refinement factor, see `rubbed_mesh`.
+            refinement: Refinement factor, see `sliding_block_mesh`.
         """
-        mesh, self.tags = rubbed_mesh(fine)
+        mesh, self.tags = sliding_block_mesh(refinement)
         V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
         self.u = fem.Function(V)
         modulus = fem.Function(fem.functionspace(mesh, ("DG", 0)))
@@ -115,6 +115,6 @@ class Rubbed:
         opposite = fc.DeformableBody(self.tags, LOWER)
         self.contact = fc.Contact(self.u, surface, opposite, law, kinematics="finite")
 
-    def lead(self, along: float, down: float) -> None:
+    def set_top_displacement(self, along: float, down: float) -> None:
         """Set the displacement of the top of the upper block."""
         self._top.value[:] = along, -down

@@ -10,8 +10,8 @@ import ufl
 
 import fenics_contact as fc
 from scenes.bodies import Bodies, boxes
-from scenes.comparing import close
-from scenes.tags import near
+from scenes.comparison import is_close
+from scenes.tags import at_coordinate
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 RADIUS = 1.0
@@ -47,10 +47,10 @@ def forces(shape, length, *, quadrature=None, degree=1, **options):
     found = []
     for share in (0.0, 0.35):
         up = np.linspace(-5.0, 0.0, 4)
-        sides = {1: near(1, -5.0), 2: near(1, 0.0)}
+        sides = {1: at_coordinate(1, -5.0), 2: at_coordinate(1, 0.0)}
         across = length * np.arange(-4.0, 5.0)
         block = Bodies(boxes([[across, up]], sides), 1000.0, 0.3, degree=degree)
-        block.hold(1, 0, 1)
+        block.prescribe(1, 0, 1)
         tool = SHAPES[shape](np.array([share * length, RADIUS - 0.3]))
         options = {"kinematics": "finite"} | options
         contact = block.contact(2, tool, fc.Coulomb(0.3), quadrature=quadrature, **options)
@@ -84,7 +84,9 @@ def test_default_points_where_the_radius_is_resolved():
 
     def points(obstacle, length=0.25, **options):
         axes = [length * np.arange(5.0), np.linspace(-1.0, 0.0, 2)]
-        block = Bodies(boxes([axes], {2: near(1, 0.0)}), 1.0, 0.3, degree=options.pop("degree", 1))
+        block = Bodies(
+            boxes([axes], {2: at_coordinate(1, 0.0)}), 1.0, 0.3, degree=options.pop("degree", 1)
+        )
         return block.contact(2, obstacle, fc.Frictionless(), **options).quadrature
 
     tool = fc.Cylinder((0.0, RADIUS), RADIUS)
@@ -113,4 +115,4 @@ def test_insufficient_points_cause_a_warning(enforcement):
         if enforcement == "penalty":
             forces("distance", 0.5)
     fine, _ = forces("distance", 2.0, enforcement=enforcement, quadrature=78)
-    assert close(found, fine, 0.04)
+    assert is_close(found, fine, 0.04)

@@ -15,19 +15,19 @@ import fenics_contact as fc
 from fenics_contact import compat
 from fenics_contact.types import Array
 from scenes.blocks import dimension
-from scenes.elasticity import displacement_space, hold, residual
+from scenes.elasticity import dirichlet_bc, displacement_space, residual
 from scenes.histories import History
-from scenes.meshes import mesh_of
-from scenes.tags import near, tagged
+from scenes.meshes import create_mesh
+from scenes.tags import at_coordinate, tag_by_midpoints
 
-BASE, TOP, ROUND, LID, SIDE = 1, 2, 3, 4, 5
-E, NU, RADIUS, DEEP = 1000.0, 0.3, 4.0, 0.01
+BASE, TOP, SOLE, SHOE_TOP, SIDE = 1, 2, 3, 4, 5
+E, NU, RADIUS, DEPTH = 1000.0, 0.3, 4.0, 0.01
 # Cells of the block, with edges 2 (and 2) and 0.4: its top has more than a thousand dofs.
 CELLS = {"quadrilateral": (520, 4), "triangle": (520, 4), "tetrahedron": (19, 19, 2)}
 HEIGHT = 0.4
 
 
-class Pressed(History):
+class IndentedBlock(History):
     """A ball or disc that is pressed into the middle until t = 1, then dragged with velocity 0.25.
 
     Attributes:
@@ -40,8 +40,8 @@ class Pressed(History):
         law: Any = None,
         *,
         cell: str = "quadrilateral",
-        within: float = 1.0,
-        deep: float = DEEP,
+        contact_half_width: float = 1.0,
+        depth: float = DEPTH,
         force: float = 0.0,
         pressure: float = 0.0,
         length: float = 1.0,
@@ -54,8 +54,8 @@ class Pressed(History):
         Args:
             law: Contact law, by default Coulomb's.
             cell: Cell type.
-            within: Half-width of Γc.
-            deep: Displacement of the ball.
+            contact_half_width: Half-width of Γc.
+            depth: Displacement of the ball.
             force: Force on the ball; 0: its displacement is prescribed.
             pressure: Pressure on the base; if it is not 0, the base is free, and only the ball
                 supports the block vertically.
@@ -70,31 +70,37 @@ class Pressed(History):
         mesh = make(comm, [low * length, high * length], CELLS[cell], CellType[cell])
 
         def top(x: Array, cells: Array) -> Array:
-            return near(up, 0.0)(x, cells) & (np.abs(x[:, 0]) < within * length)
+            return at_coordinate(up, 0.0)(x, cells) & (
+                np.abs(x[:, 0]) < contact_half_width * length
+            )
 
-        where = {SIDE: near(0, -length), BASE: near(up, -HEIGHT * length), TOP: top}
-        tags = tagged(mesh, where)
+        where = {
+            SIDE: at_coordinate(0, -length),
+            BASE: at_coordinate(up, -HEIGHT * length),
+            TOP: top,
+        }
+        tags = tag_by_midpoints(mesh, where)
         self.u = fem.Function(displacement_space(mesh, 1))
         v = ufl.TestFunction(self.u.function_space)
-        self._deep, self._most, self._length = deep * length, force * length**up, length
+        self._depth, self._force, self._length = depth * length, force * length**up, length
         self._pressure = pressure
         self.along, self.down, self.force, self.push = (fem.Constant(mesh, 0.0) for _ in range(4))
-        still = [0.0] * (d - 2)
-        moved: Any = ufl.as_vector([self.along, *still, self.down])
+        zeros = [0.0] * (d - 2)
+        motion: Any = ufl.as_vector([self.along, *zeros, self.down])
         if force:
-            moved = fc.Motion(
-                force=(*(None,) * up, self.force), displacement=(self.along, *still, None)
+            motion = fc.Motion(
+                force=(*(None,) * up, self.force), displacement=(self.along, *zeros, None)
             )
         centre = (*(0.0,) * up, RADIUS * length)
-        ball = fc.Ball(centre, RADIUS * length, displacement=moved)
+        ball = fc.Ball(centre, RADIUS * length, displacement=motion)
         k = 1e5 / length
         law = law or fc.Coulomb(0.3, k_n=k, k_t=k)
         surface = fc.ContactSurface(mesh, tags, TOP)
         self.contact = fc.Contact(self.u, surface, ball, law, **(contact or {}))
-        bcs = [hold(self.u, tags, BASE, i) for i in range(d)]
+        bcs = [dirichlet_bc(self.u, tags, BASE, i) for i in range(d)]
         F = residual(self.u, v, E, NU)
         if pressure:
-            bcs = [hold(self.u, tags, SIDE, i) for i in range(up)]
+            bcs = [dirichlet_bc(self.u, tags, SIDE, i) for i in range(up)]
             F -= self.push * v[up] * ufl.Measure("ds", mesh, subdomain_data=tags)(BASE)
         self.problem = fc.ContactProblem(F, self.u, bcs=bcs, contacts=[self.contact], **options)
 
@@ -103,12 +109,12 @@ class Pressed(History):
         self.push.value = self._pressure * min(t, 1.0)
         if self._pressure:
             return
-        self.down.value = -self._deep * min(t, 1.0)
-        self.force.value = -self._most * min(t, 1.0)
+        self.down.value = -self._depth * min(t, 1.0)
+        self.force.value = -self._force * min(t, 1.0)
         self.along.value = 0.25 * max(t - 1.0, 0.0) * self._length
 
 
-class Shod(History):
+class BlockUnderShoe(History):
     """A plane block under a rounded shoe, pressed until t = 1, then dragged with velocity 0.04.
 
     Attributes:
@@ -120,14 +126,17 @@ class Shod(History):
         self,
         law: Any = None,
         *,
-        within: float = 1.0,
-        deep: float = DEEP,
+        contact_half_width: float = 1.0,
+        depth: float = DEPTH,
         update_pairs: str = "increment",
         contact: dict | None = None,
         **options: Any,
     ) -> None:
-        """Create the unloaded problem; ``within`` and ``deep`` are as in `Pressed`. Collective."""
-        self._deep = deep
+        """Create the unloaded problem. Collective.
+
+        ``contact_half_width`` and ``depth`` are as in `IndentedBlock`.
+        """
+        self._depth = depth
         cell, x, cells, offset = "quadrilateral", [], [], 0
         for low, high, n in (
             ((-1.0, -HEIGHT), (1.0, 0.0), CELLS[cell]),
@@ -139,22 +148,34 @@ class Shod(History):
             offset += len(x[-1])
         # The lower side of the shoe is a parabola with the radius of the ball in the middle.
         x[1][:, 1] += (1 - x[1][:, 1] / 0.3) * x[1][:, 0] ** 2 / (2 * RADIUS)
-        mesh = mesh_of(cell, np.concatenate(x), np.concatenate(cells))
+        mesh = create_mesh(cell, np.concatenate(x), np.concatenate(cells))
 
         def top(x: Array, cells: Array) -> Array:
-            return near(1, 0.0)(x, cells) & (cells[:, 1] < 0) & (np.abs(x[:, 0]) < within)
+            return (
+                at_coordinate(1, 0.0)(x, cells)
+                & (cells[:, 1] < 0)
+                & (np.abs(x[:, 0]) < contact_half_width)
+            )
 
         def sole(x: Array, cells: Array) -> Array:
             return (cells[:, 1] > 0) & (x[:, 1] < 0.2999) & (np.abs(x[:, 0]) < 1.1999)
 
-        where = {BASE: near(1, -HEIGHT), TOP: top, ROUND: sole, LID: near(1, 0.3)}
-        tags = tagged(mesh, where)
+        where = {
+            BASE: at_coordinate(1, -HEIGHT),
+            TOP: top,
+            SOLE: sole,
+            SHOE_TOP: at_coordinate(1, 0.3),
+        }
+        tags = tag_by_midpoints(mesh, where)
         self.u = fem.Function(displacement_space(mesh, 1))
         v = ufl.TestFunction(self.u.function_space)
         self.along, self.down = (fem.Constant(mesh, 0.0) for _ in range(2))
-        bcs = [hold(self.u, tags, BASE, i) for i in range(2)]
-        bcs += [hold(self.u, tags, LID, i, c) for i, c in enumerate((self.along, self.down))]
-        shoe = fc.DeformableBody(tags, ROUND, update_pairs=update_pairs)
+        bcs = [dirichlet_bc(self.u, tags, BASE, i) for i in range(2)]
+        bcs += [
+            dirichlet_bc(self.u, tags, SHOE_TOP, i, c)
+            for i, c in enumerate((self.along, self.down))
+        ]
+        shoe = fc.DeformableBody(tags, SOLE, update_pairs=update_pairs)
         law = law or fc.Coulomb(0.3, k_n=1e5, k_t=1e5)
         surface = fc.ContactSurface(mesh, tags, TOP)
         self.contact = fc.Contact(self.u, surface, shoe, law, **(contact or {}))
@@ -163,5 +184,5 @@ class Shod(History):
 
     def load(self, t: float) -> None:
         """Set the displacement of the top of the shoe."""
-        self.down.value = -self._deep * min(t, 1.0)
+        self.down.value = -self._depth * min(t, 1.0)
         self.along.value = 0.04 * max(t - 1.0, 0.0)

@@ -13,8 +13,8 @@ import ufl
 import fenics_contact as fc
 from fenics_contact.elasticity import NeoHookean
 from scenes.bodies import Bodies, boxes
-from scenes.comparing import close, gathered
-from scenes.tags import between, near
+from scenes.comparison import gather, is_close
+from scenes.tags import at_coordinate, at_interface
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 BORE, SURFACE, AXIS = 1, 2, 3
@@ -29,7 +29,7 @@ class Pin:
         load: Traction in the bore, downward, or vertical displacement of the bore or the hole.
     """
 
-    def __init__(self, driven, bulk="linear", *, apart=True, **options):
+    def __init__(self, loading, bulk="linear", *, apart=True, **options):
         """Create the pin in the middle of the hole, or where it touches the hole below."""
         axes = [[np.linspace(4.0, RADIUS, 5), np.linspace(0.0, 1.0, 33)]]
 
@@ -40,18 +40,18 @@ class Pin:
             angle = np.pi * (x[:, 1] - 0.5)
             return x[:, :1] * np.column_stack([np.cos(angle), np.sin(angle)])
 
-        sides = {BORE: near(0, 4.0), SURFACE: near(0, RADIUS), AXIS: ends}
+        sides = {BORE: at_coordinate(0, 4.0), SURFACE: at_coordinate(0, RADIUS), AXIS: ends}
         self.bodies = bodies = Bodies(boxes(axes, sides, bend=bend), 210e3, 0.3)
         if bulk == "rubber":
             bodies.F = NeoHookean(bodies.u, 210e3, 0.3, "plane strain").residual(bodies.v)
         self.load, hole = bodies.constant(), bodies.constant((0.0, 0.0))
-        bodies.hold(AXIS, 0)
-        if driven == "load":
+        bodies.prescribe(AXIS, 0)
+        if loading == "load":
             bodies.F += self.load * bodies.v[1] * bodies.ds(BORE)
-        elif driven == "bore":
-            bodies.hold(BORE, 1, value=self.load)
+        elif loading == "bore":
+            bodies.prescribe(BORE, 1, value=self.load)
         else:
-            bodies.hold(BORE, 1)
+            bodies.prescribe(BORE, 1)
             hole = ufl.as_vector([0.0, self.load])
         middle = (0.0, 0.0 if apart else CLEARANCE)
         around = fc.Cylinder(middle, RADIUS + CLEARANCE, inside=True, displacement=hole)
@@ -70,8 +70,8 @@ class Pin:
 @pytest.mark.each
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-@pytest.mark.parametrize("driven", ["load", "bore", "hole"])
-def test_initial_clearance_does_not_change_the_solution(driven, kinematics, enforcement):
+@pytest.mark.parametrize("loading", ["load", "bore", "hole"])
+def test_initial_clearance_does_not_change_the_solution(loading, kinematics, enforcement):
     """A pin is pressed or moved into contact, or the hole to the pin, in one or more increments.
 
     Reference: the pin touches the hole from the start. With finite kinematics the results agree to
@@ -82,28 +82,28 @@ def test_initial_clearance_does_not_change_the_solution(driven, kinematics, enfo
     """
     tolerance = 1e-5 if kinematics == "finite" else 0.06
     options = {"kinematics": kinematics, "enforcement": enforcement}
-    down = {"load": 1000.0, "bore": -0.05, "hole": 0.05}[driven]
-    flight = 0.0 if driven == "load" else down
+    down = {"load": 1000.0, "bore": -0.05, "hole": 0.05}[loading]
+    flight = 0.0 if loading == "load" else down
     for steps in (1, 4):
-        apart = Pin(driven, **options).results(0.0, flight + down, steps * (1 + (flight != 0)))
-        touching = Pin(driven, apart=False, **options).results(0.0, down, steps)
+        apart = Pin(loading, **options).results(0.0, flight + down, steps * (1 + (flight != 0)))
+        touching = Pin(loading, apart=False, **options).results(0.0, down, steps)
         assert np.all(np.abs(apart - touching) <= tolerance * np.abs(touching))
         if flight:  # approach and contact in one increment
-            at_once = Pin(driven, **options).results(0.0, flight + down, 1)
+            at_once = Pin(loading, **options).results(0.0, flight + down, 1)
             if steps == 1:
                 assert np.all(np.abs(at_once - touching) <= tolerance * np.abs(touching))
 
 
-@pytest.mark.parametrize("driven", ["bore", "hole"])
-def test_rubber_pin_moves_into_contact_in_one_increment(driven):
+@pytest.mark.parametrize("loading", ["bore", "hole"])
+def test_rubber_pin_moves_into_contact_in_one_increment(loading):
     """A neo-Hookean pin moves into contact in one increment with the tangent of its start.
 
     Reference: the pin touches the hole from the start; 1 % for terms nonlinear in the displacement.
     """
-    down = {"bore": -0.05, "hole": 0.05}[driven]
+    down = {"bore": -0.05, "hole": 0.05}[loading]
     options = {"bulk": "rubber", "kinematics": "finite"}
-    apart = Pin(driven, **options).results(0.0, 2 * down, 1)
-    touching = Pin(driven, apart=False, **options).results(0.0, down, 1)
+    apart = Pin(loading, **options).results(0.0, 2 * down, 1)
+    touching = Pin(loading, apart=False, **options).results(0.0, down, 1)
     assert np.all(np.abs(apart - touching) <= 0.01 * np.abs(touching))
 
 
@@ -115,35 +115,35 @@ class Blocks:
         lines = np.linspace(0.0, 1.0, 5)
         under = [np.linspace(-0.5, 1.5, 9), np.linspace(-1.0 - gap, -gap, 5)]
         sides = {
-            1: between(1, -gap / 2, above=True),
-            2: near(1, 1.0),
-            3: between(1, -gap / 2, above=False),
-            4: near(1, -1.0 - gap),
+            1: at_interface(1, -gap / 2, above=True),
+            2: at_coordinate(1, 1.0),
+            3: at_interface(1, -gap / 2, above=False),
+            4: at_coordinate(1, -1.0 - gap),
         }
         # The sides of the boxes have no tag.
         for tag, height in ((1, 0.0), (3, -gap)):
-            sides[tag] = near(1, height)
+            sides[tag] = at_coordinate(1, height)
         parts = [[lines, lines], under] if opposite == "body" else [[lines, lines]]
         if opposite != "body":
             sides = {tag: sides[tag] for tag in (1, 2)}
         self.bodies = bodies = Bodies(boxes(parts, sides), 1000.0, 0.3)
-        self.way = [bodies.constant(), bodies.constant()]
+        self.prescribed = [bodies.constant(), bodies.constant()]
         floor = None
         if opposite == "body":
-            bodies.hold(4, 0, 1)
+            bodies.prescribe(4, 0, 1)
         if opposite == "moved":
-            bodies.hold(2, 0, 1)
-            floor = ufl.as_vector([-self.way[0], -self.way[1]])
+            bodies.prescribe(2, 0, 1)
+            floor = ufl.as_vector([-self.prescribed[0], -self.prescribed[1]])
         else:
-            for i, value in enumerate(self.way):
-                bodies.hold(2, i, value=value)
+            for i, value in enumerate(self.prescribed):
+                bodies.prescribe(2, i, value=value)
         obstacle = 3 if opposite == "body" else fc.HalfSpace((0, -gap), (0, 1), displacement=floor)
         self.contact = bodies.contact(1, obstacle, fc.Coulomb(friction=0.3), **options)
         self.problem = bodies.problem(self.contact)
 
     def go(self, along, up):
         """Displace the upper block, solve and commit; return dissipation and contact forces."""
-        for constant, value in zip(self.way, (along, up), strict=True):
+        for constant, value in zip(self.prescribed, (along, up), strict=True):
             constant.value = value
         step = self.problem.solve()
         self.problem.commit()
@@ -163,10 +163,10 @@ def test_tangential_motion_before_contact_is_not_slip(opposite, kinematics):
     gap, down, along = 0.09, 0.1, 0.003
     touch = gap / down
     found = []
-    for ways in ([(along, -down)], [(touch * along, -gap), (along, -down)]):
+    for path in ([(along, -down)], [(touch * along, -gap), (along, -down)]):
         scene = Blocks(gap, opposite, kinematics=kinematics)
-        found.append([scene.go(*way) for way in ways][-1])
-    assert close(found[0], found[1], 1e-5)
+        found.append([scene.go(*way) for way in path][-1])
+    assert is_close(found[0], found[1], 1e-5)
     assert found[0][3] < 0.25 * found[0][2]  # friction is below its bound
 
 
@@ -176,14 +176,14 @@ def test_uncommitted_solution_does_not_change_the_history():
     before = scene.contact.history.rows()
     forces = []
     for _ in range(2):
-        for constant, value in zip(scene.way, (0.003, -0.1), strict=True):
+        for constant, value in zip(scene.prescribed, (0.003, -0.1), strict=True):
             constant.value = value
         scene.problem.solve()
         forces.append(scene.contact.resultants().force)
         assert np.array_equal(scene.contact.states.committed.history, before)
         scene.problem.restore()
         assert np.array_equal(scene.contact.history.rows(), before)
-    assert close(forces[1], forces[0], 1e-9)
+    assert is_close(forces[1], forces[0], 1e-9)
 
 
 def test_first_touch_is_determined_per_contact():
@@ -206,16 +206,16 @@ def test_first_touch_is_determined_per_contact():
 
             sides |= {1 + 2 * n: low, 2 + 2 * n: high}
         bodies = Bodies(boxes(parts, sides), 1000.0, 0.3)
-        way, contacts = [bodies.constant(0.01), bodies.constant(-0.1)], []
+        displacements, contacts = [bodies.constant(0.01), bodies.constant(-0.1)], []
         for n in range(len(gaps)):
-            for i, value in enumerate(way):
-                bodies.hold(2 + 2 * n, i, value=value)
+            for i, value in enumerate(displacements):
+                bodies.prescribe(2 + 2 * n, i, value=value)
             floor = fc.HalfSpace((0, 0), (0, 1))
             contacts.append(bodies.contact(1 + 2 * n, floor, LAW, name=f"contact {n}"))
         bodies.problem(*contacts).solve()
         comm = bodies.mesh.comm
         return [
-            np.sort(gathered(comm, np.column_stack([c.values.increment[:, 0]])).ravel())
+            np.sort(gather(comm, np.column_stack([c.values.increment[:, 0]])).ravel())
             for c in contacts
         ]
 

@@ -41,7 +41,7 @@ class Overclosure(fc.Law):
 
 
 @dataclass(frozen=True)
-class Bond(fc.Law):
+class Adhesive(fc.Law):
     """An adhesive with the normal traction k_n o exp(-o/h) at the opening or penetration o."""
 
     k_n: Any
@@ -76,7 +76,7 @@ class Bond(fc.Law):
 
 
 @dataclass(frozen=True)
-class Asperities(fc.FrictionLaw):
+class AsperityFriction(fc.FrictionLaw):
     """Coulomb friction with the pressure p0 (exp(δ/h) - 1) at the penetration δ ≥ 0."""
 
     friction: Any
@@ -105,7 +105,7 @@ class Asperities(fc.FrictionLaw):
 
 
 @dataclass(frozen=True)
-class Saturating(fc.FrictionLaw):
+class SaturatingFriction(fc.FrictionLaw):
     """Friction with the saturating bound s (1 - exp(-μ p/s)), nearly Coulomb's for p ≪ s/μ."""
 
     friction: Any

@@ -24,10 +24,16 @@ import fenics_contact as fc
 from fenics_contact import output, parallel, plotting
 from fenics_contact.surface import surface
 from fenics_contact.systems import dense
-from scenes.comparing import close, identical, nodal, raised_everywhere, shared_folder
+from scenes.block_on_ball import PATH, BlockOnBall, copy_state, solve_path
+from scenes.comparison import (
+    are_identical,
+    assert_raised_on_all_ranks,
+    is_close,
+    nodal_values,
+    shared_folder,
+)
 from scenes.elasticity import stress
-from scenes.processes import command, environment
-from scenes.rubbing import PATH, Rub, snapshot, walk
+from scenes.processes import command, subprocess_environment
 
 COMM = MPI.COMM_WORLD
 LAST = COMM.size - 1
@@ -54,33 +60,33 @@ def failing(function, after, error=Fault, *, rank=None):
     return call
 
 
-def survives(made, call, kind, *words):
+def assert_state_unchanged(made, call, kind, *words):
     """Check that the call raises on all ranks and leaves the state of the problem unchanged."""
-    before, increment = snapshot(made), made.problem.increment
-    raised_everywhere(call, kind, *words)
-    assert identical(snapshot(made), before)
+    before, increment = copy_state(made), made.problem.increment
+    assert_raised_on_all_ranks(call, kind, *words)
+    assert are_identical(copy_state(made), before)
     assert made.problem.increment == increment
     assert made.contact.inputs.stiffness_factor.value == 1.0
 
 
-def told(error):
+def expected_error_types(error):
     """Return the types that this rank may raise for an error on the first rank only."""
     return error if COMM.rank == 0 else (error, RuntimeError)
 
 
-def goes_on(made, twin):
+def assert_solves_like_reference(made, reference):
     """Solve the increment, and compare u with that of the problem without faults, to 1e-8."""
-    for m in (made, twin):
-        walk(m, path=PATH[2:3])
-    assert close(nodal(made.scene.u), nodal(twin.scene.u), 1e-8)
+    for m in (made, reference):
+        solve_path(m, path=PATH[2:3])
+    assert is_close(nodal_values(made.scene.u), nodal_values(reference.scene.u), 1e-8)
 
 
 def pair(method="lbfgs", **kwargs):
     """Return two problems after two increments, with the load of the third."""
-    both = [Rub(method=method, **kwargs) for _ in range(2)]
+    both = [BlockOnBall(method=method, **kwargs) for _ in range(2)]
     for made in both:
-        walk(made, path=PATH[:2])
-        made.move(*PATH[2])
+        solve_path(made, path=PATH[:2])
+        made.set_top_displacement(*PATH[2])
     return both
 
 
@@ -92,48 +98,50 @@ def pair(method="lbfgs", **kwargs):
 @pytest.mark.parametrize("method", METHODS)
 def test_exception_in_a_callback_is_raised_unchanged(method, condensation, monkeypatch):
     """An exception in the residual or, if SNES evaluates it, the tangent is raised unchanged."""
-    made, twin = pair(method, condensation=condensation)
+    made, reference = pair(method, condensation=condensation)
     equations = made.problem.solver.equations
     names = {"newton": "assemble_tangent", "continuation": "assemble_tangent"}
     for name in filter(None, ("residual", names.get(method))):
         for after in (1, 3) if name == "residual" else (0,):
             with monkeypatch.context() as patch:
                 patch.setattr(equations, name, failing(getattr(equations, name), after))
-                survives(made, made.problem.solve, Fault, "on purpose")
-    goes_on(made, twin)
+                assert_state_unchanged(made, made.problem.solve, Fault, "on purpose")
+    assert_solves_like_reference(made, reference)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_exception_on_one_rank_is_raised_on_all(method, monkeypatch):
     """A MemoryError in the assembly on one rank is raised there; the other ranks get its text."""
-    made, twin = pair(method)
+    made, reference = pair(method)
     for after in (0, 4):
         with monkeypatch.context() as patch:
             broken = failing(fem.assemble_vector, after, MemoryError, rank=LAST)
             patch.setattr(surface.fem, "assemble_vector", broken)
-            survives(made, made.problem.solve, (MemoryError, RuntimeError), "on purpose")
-    goes_on(made, twin)
+            assert_state_unchanged(
+                made, made.problem.solve, (MemoryError, RuntimeError), "on purpose"
+            )
+    assert_solves_like_reference(made, reference)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_stopped_snes_restores_the_last_commit(method, monkeypatch):
     """SNES is stopped by an iteration limit of 0 or 1, and by KeyboardInterrupt in its test."""
-    made, twin = pair(method)
+    made, reference = pair(method)
     limit = made.problem.solver.main.max_it
     for allowed in (0, 1):
         made.problem.solver.main.max_it = allowed
-        survives(made, made.problem.solve, fc.NotConverged, "iteration limit reached")
+        assert_state_unchanged(made, made.problem.solve, fc.NotConverged, "iteration limit reached")
     made.problem.solver.main.max_it = limit
     equations = made.problem.solver.equations
     monkeypatch.setattr(
         equations, "is_converged", failing(equations.is_converged, 1, KeyboardInterrupt)
     )
-    before = snapshot(made)
+    before = copy_state(made)
     with pytest.raises(KeyboardInterrupt):
         made.problem.solve()
-    assert identical(snapshot(made), before)
+    assert are_identical(copy_state(made), before)
     monkeypatch.undo()
-    goes_on(made, twin)
+    assert_solves_like_reference(made, reference)
 
 
 @pytest.mark.each
@@ -151,19 +159,19 @@ def test_exception_in_a_dense_solve_is_raised_unchanged(kind, name, method, erro
 
     The dense matrix is on the first rank; the other ranks get the text of the error.
     """
-    made, twin = pair(method)
+    made, reference = pair(method)
     for after in (0, 1, 2, 5):
         with monkeypatch.context() as patch:
             broken = failing(getattr(kind, name), after, error)
             patch.setattr(kind, name, broken)
-            before = snapshot(made)
+            before = copy_state(made)
             try:
                 made.problem.solve()
-            except told(error):
-                assert identical(snapshot(made), before)
+            except expected_error_types(error):
+                assert are_identical(copy_state(made), before)
             else:  # there were fewer calls
                 made.problem.restore()
-    goes_on(made, twin)
+    assert_solves_like_reference(made, reference)
 
 
 @contextmanager
@@ -203,36 +211,36 @@ def test_an_interrupt_at_any_time(method, condensation):
 
     Interrupts are sent by the count of calls: a solve may take less than the tick of a timer.
     """
-    made, twin = pair(method, condensation=condensation)
+    made, reference = pair(method, condensation=condensation)
     made.problem.solve()  # compiles
     made.problem.restore()
     with interrupted_at(0) as events:
         made.problem.solve()
-    solved = snapshot(made)[0]
+    solved = copy_state(made)[0]
     made.problem.restore()
-    before, handler = snapshot(made), signal.getsignal(signal.SIGINT)
+    before, handler = copy_state(made), signal.getsignal(signal.SIGINT)
     for share in np.linspace(0.01, 0.99, 50):
         with pytest.raises(KeyboardInterrupt), interrupted_at(int(share * events[0])):
             made.problem.solve()
-        if close(snapshot(made)[0], solved, 1e-8):  # the solve was complete
+        if is_close(copy_state(made)[0], solved, 1e-8):  # the solve was complete
             made.problem.restore()
-        assert identical(snapshot(made), before)
+        assert are_identical(copy_state(made), before)
         assert signal.getsignal(signal.SIGINT) is handler
-    goes_on(made, twin)
+    assert_solves_like_reference(made, reference)
 
 
 @pytest.mark.parametrize("name", ["product", "_solve"])
 def test_exception_in_a_linearised_solve_is_raised_unchanged(name, monkeypatch):
     """An exception in a product or solve of the error estimate is raised; later solves succeed."""
-    made, twin = pair("newton")
+    made, reference = pair("newton")
     made.problem.solve()
     kind = dense.SumOperator if name == "product" else dense.UpdatedLU
     with monkeypatch.context() as patch:
         patch.setattr(kind, name, failing(getattr(kind, name), 0))
-        with pytest.raises(told(Fault), match="on purpose"):
+        with pytest.raises(expected_error_types(Fault), match="on purpose"):
             fc.estimate_errors(made.problem, stress(made.scene.u, made.scene.E, made.scene.nu))
     made.problem.restore()
-    goes_on(made, twin)
+    assert_solves_like_reference(made, reference)
 
 
 @pytest.mark.parametrize(
@@ -245,23 +253,23 @@ def test_exception_in_a_linearised_solve_is_raised_unchanged(name, monkeypatch):
 )
 def test_mumps_out_of_memory_raises_memory_error(method, condensation, prefix):
     """MUMPS with a limit of 1 MB, too little for this mesh, gives MemoryError, not a solution."""
-    made = Rub(mesh={"n": 64}, method=method, condensation=condensation)
-    made.move(*PATH[0])
+    made = BlockOnBall(mesh={"n": 64}, method=method, condensation=condensation)
+    made.set_top_displacement(*PATH[0])
     options, key = PETSc.Options(), f"{prefix}mat_mumps_icntl_23"
     options[key] = 1
     try:
-        survives(made, made.problem.solve, MemoryError, "out of memory")
+        assert_state_unchanged(made, made.problem.solve, MemoryError, "out of memory")
     finally:
         del options[key]
     assert made.problem.solve().verdict.failures == []
 
 
 ALONE = """
-from scenes.rubbing import PATH, Rub
+from scenes.block_on_ball import PATH, BlockOnBall
 from fenics_contact import parallel
 parallel.ABORT_TIMEOUT = 0.2
-made = Rub()
-made.move(*PATH[0])
+made = BlockOnBall()
+made.set_top_displacement(*PATH[0])
 name, rank = "{name}", made.problem.u.function_space.mesh.comm.rank
 equations = made.problem.solver.equations
 kept = getattr(equations, name)
@@ -275,7 +283,7 @@ made.problem.solve()
 def test_error_on_one_rank_without_communication_aborts_all(name):
     """If the other ranks wait for a failed one, all are aborted, and the error is printed."""
     words = command(2, "-c", ALONE.format(name=name))
-    done = subprocess.run(words, env=environment(), capture_output=True, timeout=60)
+    done = subprocess.run(words, env=subprocess_environment(), capture_output=True, timeout=60)
     said = done.stderr.decode(errors="replace")
     assert done.returncode != 0
     assert "rank 1 failed while the others were waiting" in said and "ZeroDivisionError" in said
@@ -283,19 +291,19 @@ def test_error_on_one_rank_without_communication_aborts_all(name):
 
 def test_error_in_a_load_function_on_one_rank_is_raised_on_all():
     """The user's load function raises on one rank: all ranks raise, and the load is restored."""
-    made = Rub()
+    made = BlockOnBall()
 
     def load(t):
         if t == 2.0 and COMM.rank == LAST:
             raise ValueError("no such load")
-        made.move(0.0, 0.01 * t)
+        made.set_top_displacement(0.0, 0.01 * t)
 
     done = []
 
     def run():
         done.extend(s.load for s in fc.increments(made.problem, load, 0.0, 2.0, steps=2))
 
-    raised_everywhere(run, ValueError, "no such load")
+    assert_raised_on_all_ranks(run, ValueError, "no such load")
     assert done == [1.0] and made.problem.increment == 1
     assert made.push[-1].value == -0.01
 
@@ -305,9 +313,9 @@ def test_error_in_a_load_function_on_one_rank_is_raised_on_all():
 
 def test_failed_commit_restores_the_history():
     """An error after the history was written in `commit` restores the state before the solve."""
-    made, twin = pair()
+    made, reference = pair()
     problem = made.problem
-    before = snapshot(made)
+    before = copy_state(made)
     problem.solve()
     update = made.contact.history.packed
 
@@ -316,11 +324,11 @@ def test_failed_commit_restores_the_history():
         raise Fault("put in on purpose")
 
     made.contact.history.packed = broken
-    raised_everywhere(problem.commit, Fault, "on purpose")
+    assert_raised_on_all_ranks(problem.commit, Fault, "on purpose")
     made.contact.history.packed = update
-    assert identical(snapshot(made), before)
+    assert are_identical(copy_state(made), before)
     assert problem.increment == 2
-    goes_on(made, twin)
+    assert_solves_like_reference(made, reference)
 
 
 # ---- a full disk ---------------------------------------------------------------------------------
@@ -350,8 +358,8 @@ def files(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("first", [True, False])
 def test_full_disk_leaves_files_unchanged(kind, first, tmp_path):
     """A file that could not be written is absent or unchanged; the next one is complete."""
-    made = Rub()
-    walk(made, path=PATH[:2])
+    made = BlockOnBall()
+    solve_path(made, path=PATH[:2])
     points = made.contact.gather()
     write = {
         "checkpoint": lambda: fc.checkpoint.save(made.problem, tmp_path / "state.npz"),
@@ -364,12 +372,12 @@ def test_full_disk_leaves_files_unchanged(kind, first, tmp_path):
         os.remove(tmp_path / "p.png")
     if not first:
         write()
-    before, state = files(tmp_path), snapshot(made)
+    before, state = files(tmp_path), copy_state(made)
     for size in (0, 500):
         with full_disk(size), pytest.raises((OSError, RuntimeError)):
             write()
         assert files(tmp_path) == before
-        assert identical(snapshot(made), state)
+        assert are_identical(copy_state(made), state)
     write()
     after = files(tmp_path)
     assert after and set(before) <= set(after)
@@ -381,14 +389,14 @@ def test_full_disk_leaves_files_unchanged(kind, first, tmp_path):
 def test_failed_writing_leaves_no_files(kind, tmp_path, monkeypatch):
     """All ranks raise if a file cannot be renamed to its final name, and no part of it is left."""
     folder = shared_folder(tmp_path)
-    made = Rub()
+    made = BlockOnBall()
     write = {
         "json": lambda: output.write_json(folder / "r.json", {"x": 1}, COMM),
         "series": lambda: fc.Writer(folder, made.problem).write(1),
     }[kind]
     with monkeypatch.context() as patch:
         patch.setattr(os, "replace", failing(os.replace, 0, OSError))
-        raised_everywhere(write, (OSError, RuntimeError), "on purpose")
+        assert_raised_on_all_ranks(write, (OSError, RuntimeError), "on purpose")
     assert files(folder) == {}
     write()
     assert files(folder)
@@ -402,6 +410,6 @@ def test_collective_errors_raise_on_all_ranks():
             if COMM.rank == LAST:
                 raise kind("put in on purpose")
 
-    raised_everywhere(lambda: call(ValueError), ValueError, "on purpose")
-    raised_everywhere(lambda: call(Fault), (Fault, RuntimeError), "on purpose")
+    assert_raised_on_all_ranks(lambda: call(ValueError), ValueError, "on purpose")
+    assert_raised_on_all_ranks(lambda: call(Fault), (Fault, RuntimeError), "on purpose")
     assert np.all(COMM.allgather(1) == np.ones(COMM.size))

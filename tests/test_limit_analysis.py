@@ -10,10 +10,10 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.methods.limit_analysis import find_overload
 from scenes.blocks import LEFT, RIGHT, TOP, block
-from scenes.comparing import raised_everywhere
-from scenes.elasticity import hold
+from scenes.comparison import assert_raised_on_all_ranks
+from scenes.elasticity import dirichlet_bc
 from scenes.rubber import rubber
-from scenes.tags import plane, sides
+from scenes.tags import plane, tag_by_nodes
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 
@@ -84,7 +84,7 @@ def test_overload_is_reported_after_few_iterations(method):
                 raise
 
         words = "overload: along the rotation about z", "Try a smaller load, more friction"
-        raised_everywhere(solve, fc.NotConverged, *words)
+        assert_raised_on_all_ranks(solve, fc.NotConverged, *words)
         # Measured: 0 to 138, including fallback methods; continuation uses at most 25 iterations
         # for each of three stiffnesses.
         assert failed[0].iterations < 200
@@ -120,7 +120,7 @@ def test_tight_fit_is_no_overload(by, cell, method):
     """
     modulus, stiffness, depth = 1000.0, 1e5, 1e-3
     scene = block(cell, E=modulus, nu=0.0, n=4)
-    pressed = scene.hold(TOP, scene.mesh.geometry.dim - 1, -depth if by == "top" else 0.0)
+    pressed = scene.dirichlet_bc(TOP, scene.mesh.geometry.dim - 1, -depth if by == "top" else 0.0)
     law, contact = fc.Coulomb(MU, k_n=stiffness, k_t=stiffness), {}
     if by == "gap":
         contact["gap"] = -depth
@@ -148,7 +148,7 @@ def test_tight_fit_with_multipliers_and_soft_springs_is_no_overload(by, share, s
     """
     modulus, depth, tolerance = 1000.0, 1e-3, 1e-6
     scene = block("quadrilateral", E=modulus, nu=0.0, n=4)
-    pressed = scene.hold(TOP, 1, -depth if by == "top" else 0.0)
+    pressed = scene.dirichlet_bc(TOP, 1, -depth if by == "top" else 0.0)
     contact = {"enforcement": "augmented", "tolerance": tolerance}
     if by == "gap":
         contact["gap"] = -depth
@@ -198,7 +198,7 @@ def test_unconstrained_rubber_is_refused_with_limit_load(what, kinematics):
     made: list[int] = []
     problem.snes.setMonitor(lambda snes, iteration, norm: made.append(iteration))
     force.value[:], text = NOT_HELD[what]
-    raised_everywhere(problem.solve, ValueError, text)
+    assert_raised_on_all_ranks(problem.solve, ValueError, text)
     # Measured: 18 residuals in all cases; a second attempt would have at least 14 more.
     assert len(made) <= 30
 
@@ -217,7 +217,7 @@ def test_slow_augmentations_are_continued_to_equilibrium(method):
     depth = fem.Constant(scene.mesh, 0.0)
     problem, contact = scene.problem(
         fc.Coulomb(MU, k_n=stiffness, k_t=stiffness),
-        [scene.hold(TOP, 1, depth)],
+        [scene.dirichlet_bc(TOP, 1, depth)],
         contact={"enforcement": "augmented", "tolerance": 0.04},
         small_displacement_tolerance=np.inf,
         method=method,
@@ -244,7 +244,7 @@ def test_overload_of_a_clamped_block_is_reported():
         corners = [(0.0, low), (1.0, low + height)]
         mesh = dolfinx.mesh.create_rectangle(MPI.COMM_WORLD, corners, (n, n))
         ends = {1: lambda x: np.isclose(x[1], low), 2: lambda x: np.isclose(x[1], low + height)}
-        return mesh, None, sides(mesh, ends)
+        return mesh, None, tag_by_nodes(mesh, ends)
 
     joined = fc.join_meshes({"a": made(0.0, 2), "b": made(height, 1), "c": made(2 * height, 3)})
     space = fem.functionspace(joined.mesh, ("Lagrange", 1, (2,)))
@@ -255,8 +255,11 @@ def test_overload_of_a_clamped_block_is_reported():
     F = fc.elasticity.LinearElastic(u, modulus, nu=0.0, kind="plane strain").residual(v)
     F -= pushed * v[0] * ufl.dx
     floor, roof = joined.facet("a", 1), joined.facet("c", 2)
-    bcs = [hold(u, joined.facets, tag, 0) for tag in (floor, roof)]
-    bcs += [hold(u, joined.facets, floor, 1), hold(u, joined.facets, roof, 1, depth)]
+    bcs = [dirichlet_bc(u, joined.facets, tag, 0) for tag in (floor, roof)]
+    bcs += [
+        dirichlet_bc(u, joined.facets, floor, 1),
+        dirichlet_bc(u, joined.facets, roof, 1, depth),
+    ]
     law = fc.Coulomb(MU, 100 * modulus, 100 * modulus)
     contacts = fc.find_contact_pairs(
         u, law, distance=0.05, bodies=joined, enforcement="augmented", tolerance=1e-4
@@ -283,7 +286,7 @@ def groove(angle, n):
     mesh = dolfinx.mesh.create_box(
         MPI.COMM_WORLD, [(-0.5, 0.0, 0.0), (0.5, 1.0, 1.0)], n, dolfinx.mesh.CellType.hexahedron
     )
-    tags = sides(mesh, {LEFT: plane(0, -0.5), RIGHT: plane(0, 0.5)})
+    tags = tag_by_nodes(mesh, {LEFT: plane(0, -0.5), RIGHT: plane(0, 0.5)})
     x = mesh.geometry.x
     x[:, 0] *= 2 * (0.3 + x[:, 2] * np.tan(angle))
     u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (3,))), name="u")
@@ -362,6 +365,6 @@ def test_limit_analysis_of_polygons_and_unsupported_cases():
         (tresca, True, {"obstacle": turns, "kinematics": "finite"}),
     ):
         scene = block("hexahedron", n=2, size=(1.0, 1.0, 0.25), up=-10.0, side=4.0)
-        bcs = [scene.hold(TOP, i) for i in range(3)] if held else []
+        bcs = [scene.dirichlet_bc(TOP, i) for i in range(3)] if held else []
         problem, _ = scene.problem(law, bcs, contact=contact)
         assert overload(problem) is None

@@ -19,11 +19,11 @@ from fenics_contact.checks.body_probe import OpposingBodyProbe
 from fenics_contact.checks.tunnelling import TunnellingCheck
 from fenics_contact.elasticity import NeoHookean
 from fenics_contact.systems.operator import ContactOperator
-from scenes.elasticity import displacement_space, hold, residual
-from scenes.meshes import mesh_of
+from scenes.elasticity import dirichlet_bc, displacement_space, residual
+from scenes.meshes import create_mesh
 from scenes.stacks import FLOOR, ROOF, SIDES, floor, joint, stack
-from scenes.tags import near, tagged
-from scenes.two_blocks import BOTTOM, LOWER, TOP, UPPER, two_blocks
+from scenes.tags import at_coordinate, tag_by_midpoints
+from scenes.two_blocks import BOTTOM, LOWER_FACE, TOP, UPPER_FACE, two_blocks
 from verification.extreme_bodies import Two
 
 pytestmark = [pytest.mark.three_ranks, pytest.mark.hexahedra]
@@ -64,8 +64,8 @@ class Pair:
         self.mesh, self.tags = mesh, tags = made
         self.d = mesh.geometry.dim
         self.u = fem.Function(displacement_space(mesh, degree))
-        surface = fc.ContactSurface(mesh, tags, UPPER)
-        opposite = fc.DeformableBody(tags, LOWER)
+        surface = fc.ContactSurface(mesh, tags, UPPER_FACE)
+        opposite = fc.DeformableBody(tags, LOWER_FACE)
         self.contact = fc.Contact(self.u, surface, opposite, law, **options)
 
     @property
@@ -78,7 +78,7 @@ class Pair:
         self.u.x.array[:] = (x - self.nodes).ravel()
         self.u.x.scatter_forward()
 
-    def wobbled(self, size: float, seed: int) -> np.ndarray:
+    def perturbed_nodes(self, size: float, seed: int) -> np.ndarray:
         """Return nodal positions perturbed by sine waves, equal on any number of ranks, (n, d)."""
         rng = np.random.default_rng(seed)
         k, phase = rng.uniform(3, 9, (self.d, self.d)), rng.uniform(0, 6, self.d)
@@ -120,9 +120,9 @@ def turn(d: int, angle: float) -> np.ndarray:
 def loaded(pair: Pair, along: float) -> None:
     """Commit a state of rotated bodies, then rotate, press and shear them further."""
     d = pair.d
-    pair.place(pair.pressed(pair.wobbled(0.01, 1), 0.04, 0.0) @ turn(d, 0.7).T)
+    pair.place(pair.pressed(pair.perturbed_nodes(0.01, 1), 0.04, 0.0) @ turn(d, 0.7).T)
     pair.contact.commit()
-    pair.place(pair.pressed(pair.wobbled(0.013, 2), 0.045, along) @ turn(d, 1.1).T)
+    pair.place(pair.pressed(pair.perturbed_nodes(0.013, 2), 0.045, along) @ turn(d, 1.1).T)
 
 
 @pytest.mark.each
@@ -138,14 +138,14 @@ def test_tangent_is_the_derivative_of_the_forces(cell, degree, along, law):
     assert resultants.max_penetration > 0.01
     operator = ContactOperator(pair.contact)
     tangent = operator.tangent()
-    way = pair.wobbled(1.0, 5) - pair.nodes
+    direction = pair.perturbed_nodes(1.0, 5) - pair.nodes
     here = pair.nodes + pair.u.x.array.reshape(-1, pair.d)
     vector, product = operator.unknowns.vector(), operator.unknowns.vector()
-    vector.array[:] = way.ravel()[: vector.array.size]
+    vector.array[:] = direction.ravel()[: vector.array.size]
     tangent.mult(vector, product)
     forces = []
     for step in (1e-6, -1e-6):
-        pair.place(here + step * way)
+        pair.place(here + step * direction)
         forces.append(pair.force())
     slope = (forces[0] - forces[1]) / 2e-6
     size = MPI.COMM_WORLD.allreduce(np.abs(slope).max(initial=0.0), op=MPI.MAX)
@@ -206,7 +206,7 @@ def test_small_kinematics_are_the_limit_of_finite_kinematics():
         tractions = []
         for kinematics in ("small", "finite"):
             pair = Pair("triangle", LAWS["coulomb"], n=(5, 5), like=pair, kinematics=kinematics)
-            pair.place(pair.pressed(pair.wobbled(size, 2), 3 * size, 0.7 * size))
+            pair.place(pair.pressed(pair.perturbed_nodes(size, 2), 3 * size, 0.7 * size))
             tractions.append(pair.force() / size)
         errors.append(np.abs(tractions[0] - tractions[1]).max(initial=0.0))
     errors = np.array([MPI.COMM_WORLD.allreduce(e, op=MPI.MAX) for e in errors])
@@ -239,12 +239,12 @@ class Blocks:
         self.u = fem.Function(displacement_space(self.mesh, 1))
         v = ufl.TestFunction(self.u.function_space)
         self.top = [fem.Constant(self.mesh, 0.0) for _ in range(d)]
-        bcs = [hold(self.u, tags, BOTTOM, i) for i in range(d)]
-        bcs += [hold(self.u, tags, TOP, i, value) for i, value in enumerate(self.top)]
+        bcs = [dirichlet_bc(self.u, tags, BOTTOM, i) for i in range(d)]
+        bcs += [dirichlet_bc(self.u, tags, TOP, i, value) for i, value in enumerate(self.top)]
         self.contact = fc.Contact(
             self.u,
-            fc.ContactSurface(self.mesh, tags, UPPER),
-            fc.DeformableBody(tags, LOWER),
+            fc.ContactSurface(self.mesh, tags, UPPER_FACE),
+            fc.DeformableBody(tags, LOWER_FACE),
             law,
             kinematics="finite",
             **options,
@@ -320,10 +320,10 @@ def test_rotated_patch_has_uniform_pressure():
     assert np.abs(along).max(initial=0.0) <= 1e-12
 
 
-def _led(cell, ways):
+def _rotated_pair(cell, path):
     """Return two bodies rotated by 0.4 radians, the upper one translated from commit to commit."""
     pair = Pair(cell, fc.Coulomb(0.3, k_n=1e3, k_t=5e2), kinematics="finite")
-    for down, along in ways:
+    for down, along in path:
         pair.contact.commit()
         pair.before = pair.contact.u.copy()
         pair.place(pair.pressed(pair.nodes, down, along) @ turn(pair.d, 0.4).T)
@@ -352,7 +352,7 @@ def test_probe_of_rotated_bodies_has_the_deformed_positions():
 @pytest.mark.each
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 @pytest.mark.parametrize(
-    ("ways", "through"),
+    ("path", "through"),
     [
         ([(0.05, 0.0)], False),  # penetration as the penalty allows it
         ([(0.2, 0.0)], False),  # penetration below the height of a cell: still paired
@@ -363,16 +363,16 @@ def test_probe_of_rotated_bodies_has_the_deformed_positions():
         ([(0.05, 0.0), (0.05, 0.3), (-1.0, 0.0)], False),
     ],
 )
-def test_tunnelling_through_rotated_bodies_is_detected(cell, ways, through):
+def test_tunnelling_through_rotated_bodies_is_detected(cell, path, through):
     """Only points whose path in an increment enters the body too deep or leaves it are reported."""
-    pair = _led(cell, ways)
+    pair = _rotated_pair(cell, path)
     assert (_crossed(pair) is not None) == through
 
 
 @pytest.mark.each
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 @pytest.mark.parametrize(
-    ("ways", "through"),
+    ("path", "through"),
     [
         ([(-0.1, 0.0), (1.2, 1.0)], True),  # out at the back and to the side
         ([(-0.1, 0.0), (-0.1, 1.2), (1.2, 1.2)], False),  # around the edge
@@ -380,9 +380,9 @@ def test_tunnelling_through_rotated_bodies_is_detected(cell, ways, through):
         ([(0.05, 0.0), (0.3, 1.2)], False),  # over its edge, less deep than the height of a cell
     ],
 )
-def test_tunnelling_of_unpaired_points_is_detected(cell, ways, through):
+def test_tunnelling_of_unpaired_points_is_detected(cell, path, through):
     """Tunnelling is detected although no point has an opposite point after the increment."""
-    pair = _led(cell, ways)
+    pair = _rotated_pair(cell, path)
     assert not MPI.COMM_WORLD.allreduce(int(pair.contact.values.paired.any()))
     assert (_crossed(pair) is not None) == through
 
@@ -466,11 +466,11 @@ def test_initial_overlap_of_several_cells_is_resolved(cell):
     Closed form: both have the stretch l, and their stress (G + λ/2) (1/l - l) is that of the
     contact springs, k (l - 0.8), as their heights are 1/2. The force agrees to 1e-9.
     """
-    body = stack(cell, (10, 10), (0.5, 0.5), apart=-0.2)
+    body = stack(cell, (10, 10), (0.5, 0.5), gap=-0.2)
     u, k = body.u, 1e3
-    body.hold(SIDES, 0)
-    body.hold(FLOOR, 1)
-    body.hold(ROOF, 1)
+    body.prescribe(SIDES, 0)
+    body.prescribe(FLOOR, 1)
+    body.prescribe(ROOF, 1)
     contact = joint(body, 1, fc.Frictionless(k), kinematics="finite")
     bulk = NeoHookean(u, 100.0, 0.3, "plane strain")
     residual = bulk.residual(ufl.TestFunction(u.function_space))
@@ -494,14 +494,14 @@ def slotted() -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
     x, cells = whole.geometry.x[:, :2].copy(), compat.geometry_dofmap(whole)
     middle = x[cells].mean(axis=1)
     slot = (middle[:, 0] > 0.5) & (np.abs(middle[:, 1] - 0.55) < 0.05)
-    mesh = mesh_of("quadrilateral", x, cells[~slot])
+    mesh = create_mesh("quadrilateral", x, cells[~slot])
     chosen = {
-        LOWER: lambda x, _: np.isclose(x[:, 1], 0.5) & (x[:, 0] > 0.5),
-        UPPER: lambda x, _: np.isclose(x[:, 1], 0.6) & (x[:, 0] > 0.5),
-        BOTTOM: near(1, 0.0),
+        LOWER_FACE: lambda x, _: np.isclose(x[:, 1], 0.5) & (x[:, 0] > 0.5),
+        UPPER_FACE: lambda x, _: np.isclose(x[:, 1], 0.6) & (x[:, 0] > 0.5),
+        BOTTOM: at_coordinate(1, 0.0),
         TOP: lambda x, _: np.isclose(x[:, 1], 1.1) & (x[:, 0] > 1.4),
     }
-    return mesh, tagged(mesh, chosen)
+    return mesh, tag_by_midpoints(mesh, chosen)
 
 
 def test_self_contact_has_the_force_of_two_named_surfaces():
@@ -510,7 +510,10 @@ def test_self_contact_has_the_force_of_two_named_surfaces():
     Both faces then have quadrature points, at different positions, each with half the stiffness.
     """
     forces = []
-    for own, opposite, share in ((UPPER, LOWER, 20), ([LOWER, UPPER], [LOWER, UPPER], 10)):
+    for own, opposite, share in (
+        (UPPER_FACE, LOWER_FACE, 20),
+        ([LOWER_FACE, UPPER_FACE], [LOWER_FACE, UPPER_FACE], 10),
+    ):
         mesh, tags = slotted()
         u = fem.Function(displacement_space(mesh, 1))
         down = fem.Constant(mesh, 0.0)
@@ -522,7 +525,9 @@ def test_self_contact_has_the_force_of_two_named_surfaces():
             kinematics="finite",
         )
         body = NeoHookean(u, 100.0, 0.3, "plane strain")
-        bcs = [hold(u, tags, BOTTOM, i) for i in range(2)] + [hold(u, tags, TOP, 1, down)]
+        bcs = [dirichlet_bc(u, tags, BOTTOM, i) for i in range(2)] + [
+            dirichlet_bc(u, tags, TOP, 1, down)
+        ]
         form = body.residual(ufl.TestFunction(u.function_space))
         problem = fc.ContactProblem(form, u, bcs=bcs, contacts=[contact])
         *_, step = fc.increments(problem, down, 0.0, -0.2, steps=4)
@@ -534,7 +539,7 @@ def test_self_contact_has_the_force_of_two_named_surfaces():
 def test_round_off_magnitude_covers_the_dofs_of_new_pairs():
     """Coordinates of size 1 count in the round-off of all coupled dofs, also after sliding."""
     pair = Pair("triangle", LAWS["coulomb"], kinematics="finite")
-    bcs = [hold(pair.u, pair.tags, tag, i) for tag in (BOTTOM, TOP) for i in range(2)]
+    bcs = [dirichlet_bc(pair.u, pair.tags, tag, i) for tag in (BOTTOM, TOP) for i in range(2)]
     form = residual(pair.u, ufl.TestFunction(pair.u.function_space), 100.0, 0.3)
     problem = fc.ContactProblem(form, pair.u, bcs=bcs, contacts=[pair.contact])
     system, at_rest = problem.full, np.zeros(problem.full.unknowns.n_local)
@@ -552,7 +557,7 @@ def test_round_off_magnitude_covers_the_dofs_of_new_pairs():
 def test_residual_of_a_degenerate_surface_is_nan():
     """If Γc collapses to a line, the residual is NaN, and a line search shortens the step."""
     pair = Pair("tetrahedron", LAWS["coulomb"], kinematics="finite")
-    bcs = [hold(pair.u, pair.tags, tag, i) for tag in (BOTTOM, TOP) for i in range(3)]
+    bcs = [dirichlet_bc(pair.u, pair.tags, tag, i) for tag in (BOTTOM, TOP) for i in range(3)]
     form = residual(pair.u, ufl.TestFunction(pair.u.function_space), 100.0, 0.3)
     whole = {"bcs": bcs, "contacts": [pair.contact], "condensation": False}
     problem = fc.ContactProblem(form, pair.u, **whole)
@@ -599,9 +604,10 @@ def test_static_condensation_gives_the_full_solution(cell, degree):
         pair = Pair(cell, fc.Coulomb(0.3), degree=degree, like=pair, kinematics="finite")
         mesh, tags, last = pair.mesh, pair.tags, pair.d - 1
         side, down = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
-        bcs = [hold(pair.u, tags, BOTTOM, i) for i in range(pair.d)]
+        bcs = [dirichlet_bc(pair.u, tags, BOTTOM, i) for i in range(pair.d)]
         bcs += [
-            hold(pair.u, tags, TOP, i, {0: side, last: down}.get(i, 0.0)) for i in range(pair.d)
+            dirichlet_bc(pair.u, tags, TOP, i, {0: side, last: down}.get(i, 0.0))
+            for i in range(pair.d)
         ]
         problem = fc.ContactProblem(
             residual(pair.u, ufl.TestFunction(pair.u.function_space), 1e3, 0.3),
@@ -629,7 +635,7 @@ def test_condensation_requires_constrained_bodies(held):
     """A body constrained by contact only may be ejected, and its check needs all dofs."""
     pair = Pair("triangle", fc.Coulomb(0.3), kinematics="finite")
     tags = (BOTTOM, TOP) if held else (BOTTOM,)
-    bcs = [hold(pair.u, pair.tags, tag, i) for tag in tags for i in range(2)]
+    bcs = [dirichlet_bc(pair.u, pair.tags, tag, i) for tag in tags for i in range(2)]
     form = residual(pair.u, ufl.TestFunction(pair.u.function_space), 1e3, 0.3)
     given = (form, pair.u), {"bcs": bcs, "contacts": [pair.contact]}
     assert fc.ContactProblem(*given[0], **given[1]).solver.condensed == held

@@ -16,15 +16,15 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic, NeoHookean
 from fenics_contact.systems.ejected_bodies import find_ejected_bodies
-from scenes.beside import Beside, Box
 from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block_mesh, dimension
 from scenes.bodies import Bodies, boxes
-from scenes.comparing import close, gathered, owned
-from scenes.elasticity import displacement_space, hold, residual
-from scenes.tags import between, near
+from scenes.comparison import gather, is_close, owned_values
+from scenes.elasticity import dirichlet_bc, displacement_space, residual
+from scenes.tags import at_coordinate, at_interface
 from scenes.two_blocks import BOTTOM as BLOCKS_BOTTOM
-from scenes.two_blocks import LOWER, UPPER, E, two_blocks
+from scenes.two_blocks import LOWER_FACE, UPPER_FACE, E, two_blocks
 from scenes.two_blocks import TOP as BLOCKS_TOP
+from scenes.unrelated_bodies import Box, SceneWithUnrelatedBodies
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
 COMM = MPI.COMM_WORLD
@@ -66,9 +66,9 @@ class Free:
         force = self.contact.resultants().force / (
             self.unit * self.size ** (len(self.shift.value) - 1)
         )
-        assert close(force[[0, -1]], [-side, press], 1e-8, scale=1.0)
+        assert is_close(force[[0, -1]], [-side, press], 1e-8, scale=1.0)
         comm = self.u.function_space.mesh.comm
-        place = gathered(comm, self.contact.own_displacement()[:, :1]) / self.size
+        place = gather(comm, self.contact.own_displacement()[:, :1]) / self.size
         return step.iterations, place.mean()
 
 
@@ -101,8 +101,8 @@ def test_released_block_keeps_its_position(gap, side, along, bulk, kinematics):
 @pytest.mark.parametrize(
     ("bulk", "kinematics"), [("linear", "small"), ("linear", "finite"), ("rubber", "finite")]
 )
-@pytest.mark.parametrize("way", [(0.3, -0.05), (0.3, 0.1), (-0.3, -0.3)])
-def test_block_moves_with_the_floor_while_it_is_unloaded(way, bulk, kinematics):
+@pytest.mark.parametrize("displacement", [(0.3, -0.05), (0.3, 0.1), (-0.3, -0.3)])
+def test_block_moves_with_the_floor_while_it_is_unloaded(displacement, bulk, kinematics):
     """The block is unloaded and the floor moves in one increment; it sticks until the load is zero.
 
     Reference: the displacement of the floor, to the strain (0.02). With small displacements the
@@ -110,10 +110,10 @@ def test_block_moves_with_the_floor_while_it_is_unloaded(way, bulk, kinematics):
     """
     scene = Free("quadrilateral", bulk, kinematics=kinematics)
     scene.go(3.0, 20.0)
-    scene.traction.value[:], scene.shift.value[:] = 0.0, way
+    scene.traction.value[:], scene.shift.value[:] = 0.0, displacement
     step = scene.problem.solve()
-    ways = gathered(COMM, scene.contact.own_displacement())
-    assert np.abs(ways - way).max() < 0.02
+    displacements = gather(COMM, scene.contact.own_displacement())
+    assert np.abs(displacements - displacement).max() < 0.02
     assert step.iterations <= 5
 
 
@@ -155,10 +155,10 @@ class OnASlab:
         mesh, tags = boxes(
             [slab, block],
             {
-                BOTTOM: between(1, upper, above=True),
-                TOP: near(1, top),
-                LEFT: between(1, lower, above=False),
-                RIGHT: near(1, floor),
+                BOTTOM: at_interface(1, upper, above=True),
+                TOP: at_coordinate(1, top),
+                LEFT: at_interface(1, lower, above=False),
+                RIGHT: at_coordinate(1, floor),
             },
             simplex=simplex,
         )
@@ -170,7 +170,7 @@ class OnASlab:
         law = fc.Coulomb(friction=0.3)
         self.contact = fc.Contact(u, surface, opposite, law, kinematics="finite")
         self.place = [fem.Constant(mesh, 0.0) for _ in range(2)]
-        bcs = [hold(u, tags, RIGHT, i, value) for i, value in enumerate(self.place)]
+        bcs = [dirichlet_bc(u, tags, RIGHT, i, value) for i, value in enumerate(self.place)]
         self.problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[self.contact])
 
     def go(self, side, press, place=(0.0, 0.0)):
@@ -193,7 +193,9 @@ def test_block_in_a_bowl_slips_on_both_edges(kinematics, bulk):
     """
     radius, friction, load = 2.0, 0.05, 0.02
     edges = [np.linspace(-0.5, 0.5, 7), np.linspace(0.0, 1.0, 7)]
-    body = Bodies(boxes([edges], {BOTTOM: near(1, 0.0), TOP: near(1, 1.0)}), 1.0, 0.3)
+    body = Bodies(
+        boxes([edges], {BOTTOM: at_coordinate(1, 0.0), TOP: at_coordinate(1, 1.0)}), 1.0, 0.3
+    )
     if bulk == "rubber":
         body.F = NeoHookean(body.u, 1.0, 0.3, "plane strain").residual(body.v)
     down = body.constant()
@@ -210,9 +212,9 @@ def test_block_in_a_bowl_slips_on_both_edges(kinematics, bulk):
     assert sum(step.iterations for step in steps) <= 40
     found = contact.resultants()
     assert found.stick + found.slip == 2  # one may be at its friction bound, still sticking
-    x = np.abs(gathered(COMM, contact.points)[:, 0]).max()
+    x = np.abs(gather(COMM, contact.points)[:, 0]).max()
     sine, cosine = x / radius, np.sqrt(1 - (x / radius) ** 2)
-    assert close(found.normal_force, load / (cosine - friction * sine), 0.01)
+    assert is_close(found.normal_force, load / (cosine - friction * sine), 0.01)
 
 
 def test_released_rubber_block_keeps_its_contact():
@@ -241,7 +243,7 @@ def test_released_block_is_positioned_on_the_slab_again():
     scene.go(0.0, 0.0, (0.2, 0.1))
     step = scene.go(0.0, 1.0, (0.2, -0.2))
     assert step.iterations <= 10
-    assert close(scene.contact.resultants().force, [0.0, 1.0], 1e-8, scale=1.0)
+    assert is_close(scene.contact.resultants().force, [0.0, 1.0], 1e-8, scale=1.0)
 
 
 def _stack(
@@ -259,13 +261,13 @@ def _stack(
     axes = [[np.linspace(a, b, n + 1), np.linspace(*ends, 3)] for a, b, n, *ends in blocks]
     faces = {}
     for number, (_, _, _, low, high) in enumerate(blocks, 1):
-        faces |= {2 * number - 1: near(1, low), 2 * number: near(1, high)}
+        faces |= {2 * number - 1: at_coordinate(1, low), 2 * number: at_coordinate(1, high)}
     bodies = Bodies(boxes(axes, faces), 1e3, 0.3)
     bodies.F = NeoHookean(bodies.u, 1e3, 0.3, "plane strain").residual(bodies.v)
     up, aside = bodies.constant(), bodies.constant()
-    bodies.hold(1, 0, 1)
-    bodies.hold(2 * len(blocks), 0, value=aside)
-    bodies.hold(2 * len(blocks), 1, value=up)
+    bodies.prescribe(1, 0, 1)
+    bodies.prescribe(2 * len(blocks), 0, value=aside)
+    bodies.prescribe(2 * len(blocks), 1, value=up)
     law = fc.Coulomb(friction)
     contacts = [
         bodies.contact(2 * n + 1, 2 * n, law, name=f"joint {n}", kinematics="finite")
@@ -297,16 +299,16 @@ def test_common_prescribed_displacement_causes_no_slip(law, kinematics):
             [np.linspace(0.1, 0.9, 5), 0.5 + np.linspace(0.0, 0.5, 3)],
         ]
         sides = {
-            BOTTOM: near(1, 0.0),
-            7: between(1, 0.5, above=False),
-            8: between(1, 0.5, above=True),
-            TOP: near(1, 1.0),
-            LEFT: near(0, 0.1),
+            BOTTOM: at_coordinate(1, 0.0),
+            7: at_interface(1, 0.5, above=False),
+            8: at_interface(1, 0.5, above=True),
+            TOP: at_coordinate(1, 1.0),
+            LEFT: at_coordinate(0, 0.1),
         }
         body = Bodies(boxes(axes, sides), 1000.0, 0.3)
-        body.hold(BOTTOM, 0, value=carried)
-        body.hold(BOTTOM, 1)
-        body.hold(LEFT, 0, value=carried)
+        body.prescribe(BOTTOM, 0, value=carried)
+        body.prescribe(BOTTOM, 1)
+        body.prescribe(LEFT, 0, value=carried)
         load = body.constant([0.01, -0.1])
         body.F -= ufl.inner(load, body.v) * body.ds(TOP)
         contact = body.contact(7, 8, law, kinematics=kinematics)
@@ -326,8 +328,8 @@ def test_block_between_two_others_is_not_ejected(n, m):
     problem, down, _ = _between_two(n, m)
     (step,) = fc.increments(problem, down, 0.0, -0.05, steps=1, max_cuts=0)
     upper, lower = (step.contacts[f"joint {n}"].force for n in (2, 1))
-    assert close(upper, lower, 1e-6)
-    assert close(upper[1], 0.0265 * 1e3, 0.05)
+    assert is_close(upper, lower, 1e-6)
+    assert is_close(upper[1], 0.0265 * 1e3, 0.05)
 
 
 def test_block_with_previous_contact_force_is_not_ejected():
@@ -362,15 +364,19 @@ def test_ejected_body_is_reported():
     """
     problem, _, blocks = _between_two(6, 4)
     u, before = problem.u, problem.full.state()
-    for way, names in ((0.0, ["body 2"]), (1.0, [])):
-        u.interpolate(lambda x, way=way: np.vstack([2.0 * (x[1] < 0.515), way * (x[1] > 0.515)]))
-        blocks.displace(lambda x: 0.0 * x[:2], lambda x: x[:, 1] < 0.305)
+    for displacement, names in ((0.0, ["body 2"]), (1.0, [])):
+        u.interpolate(
+            lambda x, displacement=displacement: np.vstack(
+                [2.0 * (x[1] < 0.515), displacement * (x[1] > 0.515)]
+            )
+        )
+        blocks.set_displacement(lambda x: 0.0 * x[:2], lambda x: x[:, 1] < 0.305)
         for contact in problem.contacts:
             contact.evaluate()
         forces, start = problem.full.contact_forces(), problem.solver.equations.initial_forces
         found = find_ejected_bodies(problem.full, problem.motions, forces, before, start)
         assert [name.split(",")[0] for name in found] == names
-        assert all(close(np.array(ways)[[0, 2]], [2.0, 0.0], 1e-12) for ways in found.values())
+        assert all(is_close(np.array(ways)[[0, 2]], [2.0, 0.0], 1e-12) for ways in found.values())
 
 
 @pytest.mark.parametrize(
@@ -385,9 +391,9 @@ def test_unloaded_stack_springs_back(n_steps, bulk, kinematics):
     size, due to residuals of 1e-9 on the soft block.
     """
     axes = [[np.linspace(-0.3, 0.3, 4), np.linspace(k, k + 1.0, 3)] for k in range(3)]
-    faces = {1: near(1, 0.0), 6: near(1, 3.0)}
+    faces = {1: at_coordinate(1, 0.0), 6: at_coordinate(1, 3.0)}
     for k in (1, 2):
-        faces |= {2 * k: between(1, k, above=False), 2 * k + 1: between(1, k, above=True)}
+        faces |= {2 * k: at_interface(1, k, above=False), 2 * k + 1: at_interface(1, k, above=True)}
     bodies = Bodies(boxes(axes, faces), 1.0, 0.3)
     modulus = fem.Function(fem.functionspace(bodies.mesh, ("DG", 0)))
     for k, value in enumerate((1e2, 1e4, 1e3)):
@@ -405,10 +411,10 @@ def test_unloaded_stack_springs_back(n_steps, bulk, kinematics):
     ]
     problem = bodies.problem(*contacts)
     (step,) = fc.increments(problem, press, 0.0, 1.0, steps=1, max_cuts=0)
-    assert all(close(r.force[1], 0.6, 1e-8) for r in step.contacts.values())
+    assert all(is_close(r.force[1], 0.6, 1e-8) for r in step.contacts.values())
     *_, step = fc.increments(problem, press, 1.0, 0.0, steps=n_steps, max_cuts=0)
     assert all(np.linalg.norm(r.force) < 1e-8 for r in step.contacts.values())
-    assert np.abs(gathered(COMM, owned(bodies.u))).max() < 1e-6
+    assert np.abs(gather(COMM, owned_values(bodies.u))).max() < 1e-6
 
 
 @pytest.mark.parametrize("slope", [0.1, 0.02])
@@ -420,7 +426,7 @@ def test_wedge_displaced_by_closing_jaws_is_not_taken_for_ejected(kinematics, sl
     displacement.
     """
     lines = [[np.linspace(-0.3, 0.3, 4), np.linspace(0.0, 1.0, 5)]]
-    faces = {LEFT: near(0, -0.3), RIGHT: near(0, 0.3)}
+    faces = {LEFT: at_coordinate(0, -0.3), RIGHT: at_coordinate(0, 0.3)}
     bend = np.array([slope / 0.3, 0.0])
     mesh, tags = boxes(lines, faces, bend=lambda x: x * (1 + (x[:, 1:] - 0.5) * bend))
     wedge = Bodies((mesh, tags), 1e3, 0.3)
@@ -443,12 +449,12 @@ def test_wedge_displaced_by_closing_jaws_is_not_taken_for_ejected(kinematics, sl
     problem.commit()
     shifts[0].value[0], shifts[1].value[0] = 0.1 * slope, -0.1 * slope
     problem.solve()
-    place = gathered(COMM, problem.contacts[0].own_displacement())
+    place = gather(COMM, problem.contacts[0].own_displacement())
     assert np.abs(place[:, 1] - 0.1).max() < 1e-4
 
 
-@pytest.mark.parametrize("way", [2.5, 3.5])
-def test_body_displaced_beyond_the_moving_floor_is_reported(way):
+@pytest.mark.parametrize("displacement", [2.5, 3.5])
+def test_body_displaced_beyond_the_moving_floor_is_reported(displacement):
     """A block is reported if its displacement exceeds three times that of the floor.
 
     References: the prescribed displacements: the block moves by `way` along the floor, which moves
@@ -458,13 +464,13 @@ def test_body_displaced_beyond_the_moving_floor_is_reported(way):
     problem, u = scene.problem, scene.u
     scene.shift.value[0] = 1.0
     before = problem.full.state()
-    u.interpolate(lambda x: np.vstack([way + 0.0 * x[0], 0.5 + 0.0 * x[0]]))
+    u.interpolate(lambda x: np.vstack([displacement + 0.0 * x[0], 0.5 + 0.0 * x[0]]))
     scene.contact.evaluate()
     forces, start = problem.full.contact_forces(), problem.solver.equations.initial_forces
     found = find_ejected_bodies(problem.full, problem.motions, forces, before, start)
-    assert len(found) == (way > 3.0)
-    expected = np.hypot(way, 0.5), 3.0, 1.0
-    assert all(close(np.array(ways), expected, 1e-12) for ways in found.values())
+    assert len(found) == (displacement > 3.0)
+    expected = np.hypot(displacement, 0.5), 3.0, 1.0
+    assert all(is_close(np.array(ways), expected, 1e-12) for ways in found.values())
 
 
 def test_body_displaced_off_a_wall_by_a_ball_is_reported():
@@ -474,7 +480,7 @@ def test_body_displaced_off_a_wall_by_a_ball_is_reported():
     between ball and floor. References: the prescribed displacements, to 1e-12. All displacement
     along the wall's normal used to be attributed to the wall.
     """
-    scene = Beside({"block": Box(n=(4, 4))}, E=1e3)
+    scene = SceneWithUnrelatedBodies({"block": Box(n=(4, 4))}, E=1e3)
     down = scene.bodies.constant((0.0, 0.0))
     sides = {
         BOTTOM: fc.HalfSpace((0, 0), (0, 1)),
@@ -491,11 +497,11 @@ def test_body_displaced_off_a_wall_by_a_ball_is_reported():
         contact.evaluate()
     forces, start = problem.full.contact_forces(), problem.solver.equations.initial_forces
     found = find_ejected_bodies(problem.full, problem.motions, forces, before, start)
-    assert [close(np.array(ways), (1.0, 0.06, 0.02), 1e-12) for ways in found.values()] == [True]
+    assert [is_close(np.array(ways), (1.0, 0.06, 0.02), 1e-12) for ways in found.values()] == [True]
 
 
-@pytest.mark.parametrize(("way", "is_ejected"), [(2.5, False), (3.5, True)])
-def test_residual_of_an_ejected_body_is_nan(way, is_ejected):
+@pytest.mark.parametrize(("displacement", "is_ejected"), [(2.5, False), (3.5, True)])
+def test_residual_of_an_ejected_body_is_nan(displacement, is_ejected):
     """After an increment with force, an unloaded block is displaced off its moving floor.
 
     Reference: the prescribed displacement, at most, or more than, three times that of the floor, 1;
@@ -507,7 +513,7 @@ def test_residual_of_an_ejected_body_is_nan(way, is_ejected):
     problem.full.load[:] = 0.0
     scene.shift.value[0] = 1.0
     start = problem.full.state()
-    scene.u.x.array[::2] += way
+    scene.u.x.array[::2] += displacement
     scene.u.x.array[1::2] += 0.5
     state = problem.full.state()
     problem.full.set_state(start)
@@ -515,25 +521,25 @@ def test_residual_of_an_ejected_body_is_nan(way, is_ejected):
 
 
 @pytest.mark.parametrize("bulk", ["linear", "rubber"])
-@pytest.mark.parametrize("way", [0.003, 0.1])
-def test_lifted_block_moves_at_most_with_the_floor(way, bulk):
+@pytest.mark.parametrize("displacement", [0.003, 0.1])
+def test_lifted_block_moves_at_most_with_the_floor(displacement, bulk):
     """The block is lifted in one increment; friction moves it by at most the floor's displacement.
 
     Reference: this interval, with 1e-3 of that displacement. The consistent tangent extrapolates
     friction beyond the loss of pressure, which displaced the block in the opposite direction by six
     times the displacement of the floor.
     """
-    scene = Beside({"block": Box()}, rubber=bulk == "rubber")
+    scene = SceneWithUnrelatedBodies({"block": Box()}, rubber=bulk == "rubber")
     up, shift = scene.bodies.constant(), fem.Constant(scene.bodies.mesh, np.zeros(2))
-    scene.hold("block", TOP, 1, value=up)
+    scene.prescribe("block", TOP, 1, value=up)
     floor = fc.HalfSpace((0, 0), (0, 1), shift)
     contact = scene.contact("block", BOTTOM, floor, fc.Coulomb(0.3), kinematics="finite")
     problem = scene.problem(contact)
-    for up.value, shift.value[0] in ((-0.01, 0.0), (0.05, way)):
+    for up.value, shift.value[0] in ((-0.01, 0.0), (0.05, displacement)):
         problem.solve()
         problem.commit()
-    place = gathered(COMM, contact.own_displacement())[:, 0]
-    assert place.min() > -1e-3 * way and place.max() < 1.001 * way
+    place = gather(COMM, contact.own_displacement())[:, 0]
+    assert place.min() > -1e-3 * displacement and place.max() < 1.001 * displacement
 
 
 def test_block_left_on_the_floor_does_not_slow_newtons_method():
@@ -546,7 +552,7 @@ def test_block_left_on_the_floor_does_not_slow_newtons_method():
     u = fem.Function(displacement_space(mesh, 1))
     F = residual(u, ufl.TestFunction(u.function_space), E, 0.3)
     grip = fem.Constant(mesh, np.zeros(2))
-    upper, lower = (fc.ContactSurface(mesh, tags, tag) for tag in (UPPER, BLOCKS_BOTTOM))
+    upper, lower = (fc.ContactSurface(mesh, tags, tag) for tag in (UPPER_FACE, BLOCKS_BOTTOM))
     contacts = [
         fc.Contact(
             u,
@@ -555,7 +561,7 @@ def test_block_left_on_the_floor_does_not_slow_newtons_method():
             fc.Foundation(E, E),
             name="grip",
         ),
-        fc.Contact(u, upper, fc.DeformableBody(tags, LOWER), fc.Coulomb(0.3), name="between"),
+        fc.Contact(u, upper, fc.DeformableBody(tags, LOWER_FACE), fc.Coulomb(0.3), name="between"),
         fc.Contact(u, lower, fc.HalfSpace((0, 0), (0, 1)), fc.Coulomb(0.3), name="floor"),
     ]
     problem = fc.ContactProblem(F, u, contacts=contacts)
@@ -585,7 +591,7 @@ def test_block_in_a_bowl_is_unloaded_and_loaded_again():
     F += pressure * v[1] * ufl.ds(mesh, subdomain_data=tags)(TOP)
     bowl = fc.Ball((0.6, 4.9), 4.9, inside=True)
     contact = fc.Contact(u, fc.ContactSurface(mesh, tags, BOTTOM), bowl, fc.Coulomb(0.1))
-    problem = fc.ContactProblem(F, u, bcs=[hold(u, tags, LEFT, 0)], contacts=[contact])
+    problem = fc.ContactProblem(F, u, bcs=[dirichlet_bc(u, tags, LEFT, 0)], contacts=[contact])
     for load in (0.5, 0.25, 0.0, 0.25, 0.5):
         pressure.value = load
         step = problem.solve()
@@ -609,7 +615,9 @@ def test_friction_without_pressure_moves_the_block_with_the_floor(n, modulus, ki
     1e-3 of it (nothing constrains the block along the normal); zero force, as the load is, to 1e-8
     of the pressure.
     """
-    scene = Beside({"block": Box(size=(1.0, 0.5), n=(2 * n, n))}, E=modulus, rubber=rubber)
+    scene = SceneWithUnrelatedBodies(
+        {"block": Box(size=(1.0, 0.5), n=(2 * n, n))}, E=modulus, rubber=rubber
+    )
     pressure, shift = 1e-3 * modulus, scene.bodies.constant((0.0, 0.0))
     load = scene.bodies.constant(-pressure)
     scene.load("block", TOP, 1, load)
@@ -623,8 +631,8 @@ def test_friction_without_pressure_moves_the_block_with_the_floor(n, modulus, ki
     shift.value[:] = 0.01, -0.01
     problem.solve()
     assert np.abs(contact.resultants().force).max() < 1e-8 * pressure
-    way = gathered(COMM, (problem.full.state() - before).reshape(-1, 2))
-    assert np.abs(way - (0.01, 0.0)).max() < 1e-5
+    displacement = gather(COMM, (problem.full.state() - before).reshape(-1, 2))
+    assert np.abs(displacement - (0.01, 0.0)).max() < 1e-5
     if not rubber:  # rubber inverts by round-off at this distance
         away = before + 1e10 * problem.motions.of_bodies[1]
         assert np.isfinite(equations.residual_at(equations.system.restrict(away)))
@@ -661,14 +669,14 @@ class Pushed:
         made = {"pushed": box((place, 0.0), (1.0, 1.0)), "led": box((-1.2, 0.1), (1.0, 0.8))}
         if far:
             made["unrelated"] = Box((far, far), n=(2, 2))
-        scene = Beside(made, E=1e3, rubber=rubber)
+        scene = SceneWithUnrelatedBodies(made, E=1e3, rubber=rubber)
         if far:
             for component in range(2):
-                scene.hold("unrelated", LEFT, component)
+                scene.prescribe("unrelated", LEFT, component)
         self._led = [scene.bodies.constant(0.0) for _ in range(2)]
         self.down = scene.bodies.constant((0.0, 0.0))
         for component, constant in enumerate(self._led):
-            scene.hold("led", LEFT, component, value=constant)
+            scene.prescribe("led", LEFT, component, value=constant)
         meets = {BOTTOM: fc.HalfSpace((0, 0), self.turn[:, 1]), LEFT: ("led", RIGHT)}
         if kinematics == "finite":
             meets[TOP] = fc.Ball(self.turn @ (1.15, 3.1), 2.0, displacement=self.down)
@@ -693,8 +701,8 @@ class Pushed:
         for start, end in ((0.0, 0.85), (0.85, 0.15)):
             for along in start + (end - start) * np.arange(1, n_steps + 1) / n_steps:
                 self.step(along)
-            ways = gathered(COMM, self.contacts[0].own_displacement())
-            assert np.abs(ways - self.turn @ (0.65, 0.0)).max() < 1e-7
+            displacements = gather(COMM, self.contacts[0].own_displacement())
+            assert np.abs(displacements - self.turn @ (0.65, 0.0)).max() < 1e-7
 
 
 @pytest.mark.each

@@ -13,10 +13,10 @@ import fenics_contact as fc
 from fenics_contact.results import drawing
 from fenics_contact.results.along import along
 from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block_mesh
-from scenes.comparing import close, on_first, shared_folder
+from scenes.comparison import check_on_first_rank, is_close, shared_folder
 from scenes.elasticity import displacement_space
-from scenes.meshes import mesh_of
-from scenes.tags import sides
+from scenes.meshes import create_mesh
+from scenes.tags import tag_by_nodes
 
 COMM = MPI.COMM_WORLD
 MIDDLE, INNER, OUTER = np.array([0.3, -0.2]), 1, 2
@@ -32,13 +32,15 @@ def ring(oval=1.0):
     x = MIDDLE + np.concatenate([(1 + 0.5 * i) * circle for i in range(3)])
     corner = np.arange(2 * N)
     beside = (corner + 1) % N + corner // N * N
-    mesh = mesh_of("quadrilateral", x, np.stack([corner, beside, corner + N, beside + N], axis=1))
+    mesh = create_mesh(
+        "quadrilateral", x, np.stack([corner, beside, corner + N, beside + N], axis=1)
+    )
 
     def radius(x):
         arm = x[:2] - MIDDLE[:, None]
         return np.hypot(arm[0] / oval, arm[1])
 
-    return mesh, sides(
+    return mesh, tag_by_nodes(
         mesh, {t: lambda x, t=t: np.isclose(radius(x), float(t)) for t in (INNER, OUTER)}
     )
 
@@ -64,14 +66,14 @@ def check(contact, found, n_curves):
     def compare():
         order = np.lexsort(np.round(found.values["x"], 9).T[::-1])
         for name in ("x", "pressure", "gap", "status"):
-            assert close(found.values[name][order], points[name], 1e-12), name
+            assert is_close(found.values[name][order], points[name], 1e-12), name
         assert len(found.curves) == n_curves
         assert np.sum(found.curves, axis=0).max() == 1
         for curve in found.curves:
             steps = np.diff(found.abscissa[curve])
             assert np.all(steps > 0) or np.all(steps < 0)
 
-    on_first(compare)
+    check_on_first_rank(compare)
 
 
 @pytest.mark.parametrize("direction", [(0.0, -1.0), (-1.0, 0.0), (0.6, 0.8)])
@@ -85,8 +87,8 @@ def test_circular_hole_is_plotted_over_the_angle(direction):
     def compare():
         assert found.is_angle and found.label == "angle about (0.3, -0.2), from the x axis [°]"
         arm = found.values["x"] - MIDDLE
-        way = np.exp(1j * np.radians(found.abscissa)) - (arm @ [1, 1j]) / np.hypot(*arm.T)
-        assert np.abs(way).max() < 1e-9
+        deviation = np.exp(1j * np.radians(found.abscissa)) - (arm @ [1, 1j]) / np.hypot(*arm.T)
+        assert np.abs(deviation).max() < 1e-9
         bears = found.values["pressure"][found.curves[0]] > 0
         facets = np.any(bears.reshape(-1, 2), axis=1) if len(bears) % 2 == 0 else bears
         assert 0 < bears.sum() and np.count_nonzero(np.diff(facets.astype(int))) == 2
@@ -95,7 +97,7 @@ def test_circular_hole_is_plotted_over_the_angle(direction):
         assert abs((middle - towards + 180) % 360 - 180) < 360 / N
         assert -180 <= (found.abscissa.min() + found.abscissa.max()) / 2 <= 180
 
-    on_first(compare)
+    check_on_first_rank(compare)
 
 
 def test_both_surfaces_of_a_ring_give_two_curves():
@@ -104,7 +106,7 @@ def test_both_surfaces_of_a_ring_give_two_curves():
     contact = evaluated(mesh, tags, [INNER, OUTER], fc.Ball(MIDDLE, 1.5, inside=True))
     found = along(contact)
     check(contact, found, 2)
-    on_first(lambda: np.testing.assert_equal(found.is_angle, True))
+    check_on_first_rank(lambda: np.testing.assert_equal(found.is_angle, True))
 
 
 def test_oval_hole_is_plotted_over_the_arc_length():
@@ -121,10 +123,10 @@ def test_oval_hole_is_plotted_over_the_arc_length():
         # The distance of the points of a facet is that along their chord.
         x, s = (v.reshape(N, -1, *v.shape[1:]) for v in (found.values["x"], found.abscissa))
         chord = np.linalg.norm(x[:, -1] - x[:, 0], axis=1)
-        assert close(s[:, -1] - s[:, 0], chord, 1e-9)
-        assert close(length, chord.sum() * np.sqrt(3), 1e-9)  # chord between the Gauss points
+        assert is_close(s[:, -1] - s[:, 0], chord, 1e-9)
+        assert is_close(length, chord.sum() * np.sqrt(3), 1e-9)  # chord between the Gauss points
 
-    on_first(compare)
+    check_on_first_rank(compare)
 
 
 @pytest.mark.whole
@@ -145,7 +147,7 @@ def test_abscissa_of_the_sides_of_a_block(which, label, n_curves):
     contact = evaluated(mesh, tags, which, obstacle)
     found = along(contact)
     check(contact, found, n_curves)
-    on_first(lambda: np.testing.assert_equal(found.label.startswith(label), True))
+    check_on_first_rank(lambda: np.testing.assert_equal(found.label.startswith(label), True))
 
 
 def test_plot_shows_the_curves(tmp_path, monkeypatch):
@@ -166,4 +168,4 @@ def test_plot_shows_the_curves(tmp_path, monkeypatch):
             assert np.array_equal(y, found.values[name][curve])
         assert lower.get_xlabel() == found.label
 
-    on_first(compare)
+    check_on_first_rank(compare)

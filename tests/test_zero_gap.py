@@ -13,8 +13,8 @@ from mpi4py import MPI
 import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic
 from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block_mesh
-from scenes.comparing import gathered
-from scenes.elasticity import displacement_space, hold
+from scenes.comparison import gather
+from scenes.elasticity import dirichlet_bc, displacement_space
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 COMM = MPI.COMM_WORLD
@@ -57,12 +57,12 @@ def pressed(n, law, *, side=-1.0, degree=1, **options):
     F = LinearElastic(u, 1000.0, 0.3, "plane strain").residual(v)
     F -= side * ufl.dot(normal, v) * ds(joined.facet("inner", BOTTOM))
     planes = [(joined.facet(b, tag), i) for b in parts for tag, i in ((LEFT, 0), (RIGHT, 1))]
-    bcs = [hold(u, joined.facets, *plane) for plane in planes]
+    bcs = [dirichlet_bc(u, joined.facets, *plane) for plane in planes]
     surface = fc.ContactSurface(joined.mesh, joined.facets, joined.facet("inner", TOP))
     opposite = fc.DeformableBody(joined.facets, joined.facet("outer", BOTTOM))
     contact = fc.Contact(u, surface, opposite, law, **options)
     fc.ContactProblem(F, u, bcs=bcs, contacts=[contact]).solve()
-    p, weights = gathered(COMM, contact.pressure), gathered(COMM, contact.measure)
+    p, weights = gather(COMM, contact.pressure), gather(COMM, contact.measure)
     mean = weights @ p / weights.sum()
     scatter = np.sqrt(weights @ (p - mean) ** 2 / weights.sum())
     exact = INNER**2 / (OUTER**2 - INNER**2) * (OUTER**2 / MIDDLE**2 - 1)

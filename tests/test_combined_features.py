@@ -9,10 +9,10 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.blocks import TOP, block
-from scenes.comparing import close, nodal
-from scenes.laws import Asperities
+from scenes.comparison import is_close, nodal_values
 from scenes.stacks import FLOOR, LOWER, ROOF, UPPER, stack
-from scenes.two_blocks import Slider
+from scenes.two_blocks import SlidingBlock
+from scenes.user_laws import AsperityFriction
 
 COMM = MPI.COMM_WORLD
 K_N = 1e7
@@ -23,11 +23,11 @@ def test_law_with_normal_compliance_is_solved_with_unpaired_points():
     """A wide block on a narrow one is solved with half of the points of Γc unpaired."""
     body = stack("quadrilateral", (3, 6), (0.5, 0.5), widths=[0.5, 1.0])
     surface = fc.ContactSurface(body.mesh, body.tags, 10 + UPPER)
-    law = Asperities(0.3, 0.5, 2e-3, fc.RelativeStiffness())
+    law = AsperityFriction(0.3, 0.5, 2e-3, fc.RelativeStiffness())
     contact = fc.Contact(body.u, surface, fc.DeformableBody(body.tags, 10 + LOWER), law)
-    body.hold(FLOOR, 0, 1)
-    body.hold(ROOF, 0)
-    body.hold(ROOF, 1, value=-5e-3)
+    body.prescribe(FLOOR, 0, 1)
+    body.prescribe(ROOF, 0)
+    body.prescribe(ROOF, 1, value=-5e-3)
     problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
     step = problem.solve()
     assert 0 < contact.n_unpaired and step.verdict.failures == []
@@ -44,13 +44,16 @@ def test_restart_finds_the_same_pairs_of_penetrating_bodies(release, tmp_path):
 
     def load(made):
         def move(t):
-            made.move[-1].value, made.move[0].value = -5e-3 * min(t, 1.0), 0.1 * max(t - 1.0, 0.0)
+            made.top_displacement[-1].value, made.top_displacement[0].value = (
+                -5e-3 * min(t, 1.0),
+                0.1 * max(t - 1.0, 0.0),
+            )
 
         return move
 
     def make():
         law = fc.Coulomb(0.2, K_N / 50, K_N / 50)
-        return Slider("quadrilateral", law, start=0.4, max_initial_penetration=release)
+        return SlidingBlock("quadrilateral", law, start=0.4, max_initial_penetration=release)
 
     whole = make()
     list(fc.increments(whole.problem, load(whole), 0.0, 3.0, steps=3))
@@ -64,17 +67,17 @@ def test_restart_finds_the_same_pairs_of_penetrating_bodies(release, tmp_path):
     rest = list(fc.increments(again.problem, load(again), 0.0, 3.0, steps=3, checkpoint=path))
     assert len(rest) == 1
     assert again.contact.n_unpaired == whole.contact.n_unpaired
-    assert close(nodal(again.u), nodal(whole.u), 1e-9)
-    assert close(rest[0].contacts["contact"].force, whole.contact.resultants().force, 1e-9)
+    assert is_close(nodal_values(again.u), nodal_values(whole.u), 1e-9)
+    assert is_close(rest[0].contacts["contact"].force, whole.contact.resultants().force, 1e-9)
 
 
 def test_commit_that_fails_in_the_pair_search_changes_no_state(monkeypatch):
     """After a pair search that fails, a solve gives the results of a restored twin, to 1e-9."""
     law = fc.Coulomb(0.2, K_N, K_N)
-    made, twin = (Slider("quadrilateral", law, start=0.4) for _ in range(2))
+    made, twin = (SlidingBlock("quadrilateral", law, start=0.4) for _ in range(2))
     for each in (made, twin):
         each.step(2e-3, 0.0)
-        each.move[0].value = 0.15
+        each.top_displacement[0].value = 0.15
         each.problem.solve()
     with monkeypatch.context() as patch:
 
@@ -92,15 +95,17 @@ def test_commit_that_fails_in_the_pair_search_changes_no_state(monkeypatch):
         each.problem.solve()
         each.problem.commit()
         each.step(2e-3, 0.3)
-    assert close(nodal(made.u), nodal(twin.u), 1e-9)
-    assert close(made.contact.resultants().force, twin.contact.resultants().force, 1e-9)
+    assert is_close(nodal_values(made.u), nodal_values(twin.u), 1e-9)
+    assert is_close(made.contact.resultants().force, twin.contact.resultants().force, 1e-9)
 
 
 def test_foundation_without_tangential_stiffness_on_a_ball():
     """The small-displacement error is finite also where k_t is zero."""
     scene = block("quadrilateral", n=4)
     law = fc.Foundation(1e3, fem.Constant(scene.mesh, 0.0))
-    push = [scene.hold(TOP, i, fem.Constant(scene.mesh, v)) for i, v in enumerate((0.01, -0.05))]
+    push = [
+        scene.dirichlet_bc(TOP, i, fem.Constant(scene.mesh, v)) for i, v in enumerate((0.01, -0.05))
+    ]
     contact = {"obstacle": fc.Ball((0.5, -2.0), 2.0)}
     problem, _ = scene.problem(law, push, contact=contact, small_displacement_tolerance=np.inf)
     verdict = problem.solve().verdict
@@ -123,13 +128,13 @@ def test_fallback_without_contact_fails_without_an_error():
     """Without any contact the alternating method reports failure instead of raising."""
     scene = block("quadrilateral", n=2, up=-1.0)
     problem = fc.ContactProblem(
-        scene.F, scene.u, bcs=[scene.hold(TOP, i) for i in (0, 1)], method="newton"
+        scene.F, scene.u, bcs=[scene.dirichlet_bc(TOP, i) for i in (0, 1)], method="newton"
     )
     assert problem.solver.methods["alternating"].solve()[1] < 0
 
 
 def test_contact_between_bodies_has_no_potential():
     """Contact between two bodies cannot be written as a potential in u on Γc: refused."""
-    made = Slider("quadrilateral", fc.Frictionless(K_N), start=0.4)
+    made = SlidingBlock("quadrilateral", fc.Frictionless(K_N), start=0.4)
     with pytest.raises(ValueError, match="opposing body"):
         made.contact.potential()

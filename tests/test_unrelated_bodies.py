@@ -16,21 +16,26 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from fenics_contact.types import Array
-from scenes.beside import BUSY, Beside, Box
 from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP
-from scenes.comparing import assemble_number, close, compiled, raised_everywhere
+from scenes.comparison import (
+    assemble_scalar,
+    assert_raised_on_all_ranks,
+    compile_with_maps,
+    is_close,
+)
+from scenes.unrelated_bodies import UNRELATED_BODIES, Box, SceneWithUnrelatedBodies
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(300)]
 COMM = MPI.COMM_WORLD
 FLOOR = fc.HalfSpace((0, 0), (0, 1))
 
 
-class Play:
+class LoadHistory:
     """A scene, its load increments, and the results that are compared."""
 
     def __init__(
         self,
-        scene: Beside,
+        scene: SceneWithUnrelatedBodies,
         increments: Sequence[Callable[[], None]],
         *contacts: fc.Contact,
         measured: Sequence[ufl.Form] = (),
@@ -38,18 +43,18 @@ class Play:
     ) -> None:
         """Create the problem. Collective."""
         self.scene, self.increments, self.contacts = scene, increments, contacts
-        self.measured = [compiled(form) for form in measured]
+        self.measured = [compile_with_maps(form) for form in measured]
         self.problem = scene.problem(*contacts, **more)
 
     def run(self) -> list[Array]:
         """Solve all increments and return the contact forces and the measured integrals."""
         for number, setting in enumerate(self.increments, 1):
             setting()
-            self.scene.keep_busy(number / len(self.increments))
+            self.scene.set_unrelated_load(number / len(self.increments))
             step = self.problem.solve()
             self.problem.commit()
         forces = [step.contacts[contact.name].force for contact in self.contacts]
-        return forces + [np.array([assemble_number(form, COMM)]) for form in self.measured]
+        return forces + [np.array([assemble_scalar(form, COMM)]) for form in self.measured]
 
 
 def setting(constant, *values) -> list[Callable[[], None]]:
@@ -64,13 +69,13 @@ def setting(constant, *values) -> list[Callable[[], None]]:
 # ---- refused scenes ------------------------------------------------------------------------------
 
 
-def pops_out(busy):
+def pops_out(unrelated):
     """A wedge between two walls, unloaded in one increment: it leaves them and gains energy."""
 
     def lean(x):
         return np.column_stack([x[:, 0] * (1 + 0.2 * x[:, 1]), x[:, 1]])
 
-    scene = Beside({"wedge": Box(n=(6, 6), bend=lean)}, busy, E=1e3)
+    scene = SceneWithUnrelatedBodies({"wedge": Box(n=(6, 6), bend=lean)}, unrelated, E=1e3)
     press = scene.bodies.constant()
     scene.load("wedge", TOP, 1, press)
     walls = [
@@ -81,107 +86,109 @@ def pops_out(busy):
         )
     ]
     increments = setting(press, -10.0, 0.0)
-    return Play(scene, increments, *walls, small_displacement_tolerance=np.inf, method="newton")
+    return LoadHistory(
+        scene, increments, *walls, small_displacement_tolerance=np.inf, method="newton"
+    )
 
 
-def too_soft(busy):
+def too_soft(unrelated):
     """A block so soft that its load deforms it by many times its size."""
-    scene = Beside({"block": Box(n=(4, 4))}, busy, E=0.02)
+    scene = SceneWithUnrelatedBodies({"block": Box(n=(4, 4))}, unrelated, E=0.02)
     press = scene.bodies.constant()
     scene.load("block", TOP, 1, press)
-    scene.hold("block", TOP, 0)
+    scene.prescribe("block", TOP, 0)
     floor = scene.contact("block", BOTTOM, FLOOR, fc.Frictionless(), name="floor")
-    return Play(scene, setting(press, -1.0), floor)
+    return LoadHistory(scene, setting(press, -1.0), floor)
 
 
-def slides_far(busy):
+def slides_far(unrelated):
     """A block on a ball, moved sideways by half of its size, which changes gap and normals."""
-    scene = Beside({"block": Box(n=(6, 4))}, busy)
+    scene = SceneWithUnrelatedBodies({"block": Box(n=(6, 4))}, unrelated)
     aside = scene.bodies.constant()
-    scene.hold("block", TOP, 1, value=-0.02)
-    scene.hold("block", TOP, 0, value=aside)
+    scene.prescribe("block", TOP, 1, value=-0.02)
+    scene.prescribe("block", TOP, 0, value=aside)
     ball = fc.Ball((0.5, -2.0), 2.0)
     contact = scene.contact("block", BOTTOM, ball, fc.Frictionless(), name="ball")
-    return Play(scene, setting(aside, 0.5), contact)
+    return LoadHistory(scene, setting(aside, 0.5), contact)
 
 
-def held_inside(busy):
+def held_inside(unrelated):
     """Multipliers at a node that a Dirichlet condition prescribes inside of the obstacle."""
-    scene = Beside({"block": Box()}, busy)
+    scene = SceneWithUnrelatedBodies({"block": Box()}, unrelated)
     depth = scene.bodies.constant()
-    scene.hold("block", LEFT, 0, 1, value=depth)
+    scene.prescribe("block", LEFT, 0, 1, value=depth)
     contact = scene.contact(
         "block", BOTTOM, FLOOR, fc.Frictionless(), name="floor", enforcement="augmented"
     )
-    return Play(scene, setting(depth, -1e-3), contact)
+    return LoadHistory(scene, setting(depth, -1e-3), contact)
 
 
-def not_held(busy):
+def not_held(unrelated):
     """A block on a frictionless floor, free to translate."""
-    scene = Beside({"block": Box()}, busy)
+    scene = SceneWithUnrelatedBodies({"block": Box()}, unrelated)
     scene.load("block", TOP, 1, scene.bodies.constant(-1e-3))
     contact = scene.contact("block", BOTTOM, FLOOR, fc.Frictionless(), name="floor")
-    return Play(scene, [], contact)
+    return LoadHistory(scene, [], contact)
 
 
-def _pushed(busy, side, up):
-    scene = Beside({"block": Box()}, busy)
+def _pushed(unrelated, side, up):
+    scene = SceneWithUnrelatedBodies({"block": Box()}, unrelated)
     scene.load("block", TOP, 1, scene.bodies.constant(up))
     scene.load("block", TOP, 0, scene.bodies.constant(side))
     contact = scene.contact("block", BOTTOM, FLOOR, fc.Coulomb(0.3), name="floor")
-    return Play(scene, [lambda: None], contact)
+    return LoadHistory(scene, [lambda: None], contact)
 
 
-def pulled_off(busy):
+def pulled_off(unrelated):
     """A block that its load lifts off the floor."""
-    return _pushed(busy, 0.0, 1e-3)
+    return _pushed(unrelated, 0.0, 1e-3)
 
 
-def pushed_aside(busy):
+def pushed_aside(unrelated):
     """A block whose tangential load exceeds the friction limit."""
-    return _pushed(busy, 4e-4, -1e-3)
+    return _pushed(unrelated, 4e-4, -1e-3)
 
 
-def without_number(busy):
+def without_number(unrelated):
     """A block whose load is NaN."""
-    return _pushed(busy, 0.0, np.nan)
+    return _pushed(unrelated, 0.0, np.nan)
 
 
-def out_of_range(busy):
+def out_of_range(unrelated):
     """A block with a negative coefficient of friction."""
-    scene = Beside({"block": Box()}, busy)
-    scene.hold("block", TOP, 0, 1, value=-1e-3)
+    scene = SceneWithUnrelatedBodies({"block": Box()}, unrelated)
+    scene.prescribe("block", TOP, 0, 1, value=-1e-3)
     friction = scene.bodies.constant(-0.3)
     contact = scene.contact("block", BOTTOM, FLOOR, fc.Coulomb(friction), name="floor")
-    return Play(scene, [lambda: None], contact)
+    return LoadHistory(scene, [lambda: None], contact)
 
 
-def half_as_steep(busy):
+def half_as_steep(unrelated):
     """A signed distance with a gradient of length 2."""
-    scene = Beside({"block": Box()}, busy)
-    scene.hold("block", TOP, 0, 1, value=-1e-3)
+    scene = SceneWithUnrelatedBodies({"block": Box()}, unrelated)
+    scene.prescribe("block", TOP, 0, 1, value=-1e-3)
     floor = fc.SignedDistance(lambda x: 2 * x[1])
     contact = scene.contact("block", BOTTOM, floor, fc.Frictionless(), name="floor")
-    return Play(scene, [lambda: None], contact)
+    return LoadHistory(scene, [lambda: None], contact)
 
 
-def through_a_plate(busy):
+def through_a_plate(unrelated):
     """A block moved in one increment through a plate as thick as a fiftieth of its size."""
-    scene = Beside({"block": Box()}, busy)
+    scene = SceneWithUnrelatedBodies({"block": Box()}, unrelated)
     down = scene.bodies.constant()
-    scene.hold("block", TOP, 0, 1, value=down)
+    scene.prescribe("block", TOP, 0, 1, value=down)
     plate = fc.SignedDistance(lambda x: abs(x[1] + 0.1) - 0.01)
     contact = scene.contact("block", BOTTOM, plate, fc.Frictionless(), name="plate")
-    return Play(scene, setting(down, -0.5), contact)
+    return LoadHistory(scene, setting(down, -0.5), contact)
 
 
-def beyond_its_limit(busy):
+def beyond_its_limit(unrelated):
     """A block whose tangential load exceeds a prescribed friction limit."""
-    scene = Beside({"block": Box()}, busy)
+    scene = SceneWithUnrelatedBodies({"block": Box()}, unrelated)
     scene.load("block", TOP, 1, scene.bodies.constant(-1e-3))
     scene.load("block", TOP, 0, scene.bodies.constant(4e-4))
     contact = scene.contact("block", BOTTOM, FLOOR, fc.Tresca(1.0, 3e-4), name="floor")
-    return Play(scene, [lambda: None], contact)
+    return LoadHistory(scene, [lambda: None], contact)
 
 
 REFUSED = {
@@ -201,20 +208,22 @@ REFUSED = {
 
 
 @pytest.mark.each
-@pytest.mark.parametrize("busy", [None, *BUSY])
+@pytest.mark.parametrize("unrelated", [None, *UNRELATED_BODIES])
 @pytest.mark.parametrize("scene", REFUSED, ids=lambda scene: scene.__name__)
-def test_refusals_do_not_depend_on_unrelated_bodies(scene, busy):
+def test_refusals_do_not_depend_on_unrelated_bodies(scene, unrelated):
     """The error is the same; next to compressed, moved or distant bodies there was none."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        if scene is pops_out and busy == "far away":
+        if scene is pops_out and unrelated == "far away":
             # Round-off of the distant body changes the start: friction keeps the wedge in place
             # with the forces that eight increments yield.
-            upright, leaning = scene([BUSY[busy]]).run()
-            assert close(upright, np.array([7.21, -0.91]), 0.01) and close(leaning, -upright, 1e-6)
+            upright, leaning = scene([UNRELATED_BODIES[unrelated]]).run()
+            assert is_close(upright, np.array([7.21, -0.91]), 0.01) and is_close(
+                leaning, -upright, 1e-6
+            )
             return
-        raised_everywhere(
-            lambda: scene([BUSY[busy]] if busy else []).run(),
+        assert_raised_on_all_ranks(
+            lambda: scene([UNRELATED_BODIES[unrelated]] if unrelated else []).run(),
             (fc.NotConverged, ValueError),
             REFUSED[scene],
         )
@@ -227,59 +236,59 @@ def test_distant_wall_does_not_raise_the_deformation_limit():
     wall = fc.HalfSpace((1001.0, 0), (-1, 0))
     wall = scene.contact("block", RIGHT, wall, fc.Frictionless(), name="wall")
     scene.load("block", TOP, 1, scene.bodies.constant(-1.0))
-    play = Play(scene, [lambda: None], floor, wall)
-    raised_everywhere(play.run, fc.NotConverged, "times its size")
+    play = LoadHistory(scene, [lambda: None], floor, wall)
+    assert_raised_on_all_ranks(play.run, fc.NotConverged, "times its size")
 
 
 # ---- solved scenes -------------------------------------------------------------------------------
 
 
-def stacked(busy):
+def stacked(unrelated):
     """Three rubber blocks with gaps between them, the uppermost moved down."""
-    scene = Beside(
+    scene = SceneWithUnrelatedBodies(
         {
             "lowest": Box((0, 0), (1, 0.3), (8, 2)),
             "middle": Box((0.2, 0.31), (0.6, 0.2), (4, 2)),
             "highest": Box((0.3, 0.52), (0.4, 0.2), (6, 2)),
         },
-        busy,
+        unrelated,
         rubber=True,
         E=1e3,
     )
     down = scene.bodies.constant()
-    scene.hold("lowest", BOTTOM, 0, 1)
-    scene.hold("highest", TOP, 0)
-    scene.hold("highest", TOP, 1, value=down)
+    scene.prescribe("lowest", BOTTOM, 0, 1)
+    scene.prescribe("highest", TOP, 0)
+    scene.prescribe("highest", TOP, 1, value=down)
     joints = [
         scene.contact(box, BOTTOM, (below, TOP), fc.Coulomb(0.6), name=box, kinematics="finite")
         for box, below in (("middle", "lowest"), ("highest", "middle"))
     ]
-    return Play(scene, setting(down, -0.05), *joints)
+    return LoadHistory(scene, setting(down, -0.05), *joints)
 
 
 def _on_a_spring(stiffness):
     """A block on a floor, constrained along it by a spring that the load stretches by 1e-2."""
 
-    def on_a_spring(busy):
-        scene = Beside({"block": Box(n=(4, 4))}, busy)
+    def on_a_spring(unrelated):
+        scene = SceneWithUnrelatedBodies({"block": Box(n=(4, 4))}, unrelated)
         u, v, side = scene.bodies.u, scene.bodies.v, scene.bodies.ds(scene.tag("block", LEFT))
         scene.bodies.F += stiffness * u[0] * v[0] * side
         scene.load("block", TOP, 1, scene.bodies.constant(-1e-3))
         scene.load("block", TOP, 0, scene.bodies.constant(1e-2 * stiffness))
         contact = scene.contact("block", BOTTOM, FLOOR, fc.Frictionless(), name="floor")
-        return Play(scene, [lambda: None], contact, measured=[u[0] * side])
+        return LoadHistory(scene, [lambda: None], contact, measured=[u[0] * side])
 
     return on_a_spring
 
 
-def rubbed(busy):
+def rubbed(unrelated):
     """A block whose tangential load is below the friction limit."""
-    return _pushed(busy, 2e-4, -1e-3)
+    return _pushed(unrelated, 2e-4, -1e-3)
 
 
-def pressed_again(busy):
+def pressed_again(unrelated):
     """A block on a floor with friction, pressed, unloaded, and loaded again with shear."""
-    scene = Beside({"block": Box()}, busy)
+    scene = SceneWithUnrelatedBodies({"block": Box()}, unrelated)
     press, push = scene.bodies.constant(), scene.bodies.constant()
     scene.load("block", TOP, 1, press)
     scene.load("block", TOP, 0, push)
@@ -289,20 +298,20 @@ def pressed_again(busy):
         press.value, push.value = -down, aside
 
     loads = [(1e-3, 1e-4), (0.0, 0.0), (1e-3, -2e-4)]
-    return Play(scene, [lambda load=load: to(*load) for load in loads], contact)
+    return LoadHistory(scene, [lambda load=load: to(*load) for load in loads], contact)
 
 
-def pressed_by_its_floor(busy):
+def pressed_by_its_floor(unrelated):
     """A floor pressed by a force on a clamped block and moved sideways, at the friction limit."""
-    scene = Beside({"block": Box()}, busy)
-    scene.hold("block", TOP, 0, 1)
+    scene = SceneWithUnrelatedBodies({"block": Box()}, unrelated)
+    scene.prescribe("block", TOP, 0, 1)
     push, aside = scene.bodies.constant(1e-2), scene.bodies.constant(2e-2)
     motion = fc.Motion(force=[None, push], displacement=[aside, None])
     floor = fc.HalfSpace((0, -0.02), (0, 1), displacement=motion)
     contact = scene.contact(
         "block", BOTTOM, floor, fc.Coulomb(0.5), name="floor", kinematics="finite"
     )
-    return Play(scene, [lambda: None], contact)
+    return LoadHistory(scene, [lambda: None], contact)
 
 
 HOLD = {
@@ -316,14 +325,16 @@ _ALONE: dict[str, list[Array]] = {}
 
 
 @pytest.mark.each
-@pytest.mark.parametrize("busy", BUSY)
+@pytest.mark.parametrize("unrelated", UNRELATED_BODIES)
 @pytest.mark.parametrize("scene", HOLD)
-def test_solutions_do_not_depend_on_unrelated_bodies(scene, busy):
+def test_solutions_do_not_depend_on_unrelated_bodies(scene, unrelated):
     """Forces agree to 1e-6; stacked blocks were ejected, and weak springs were not detected."""
     if scene not in _ALONE:
         _ALONE[scene] = HOLD[scene]([]).run()
-    for found, alone in zip(HOLD[scene]([BUSY[busy]]).run(), _ALONE[scene], strict=True):
-        assert close(found, alone, 1e-6)
+    for found, alone in zip(
+        HOLD[scene]([UNRELATED_BODIES[unrelated]]).run(), _ALONE[scene], strict=True
+    ):
+        assert is_close(found, alone, 1e-6)
 
 
 def _on_multipliers(names: Sequence[str]) -> Array:
@@ -336,13 +347,13 @@ def _on_multipliers(names: Sequence[str]) -> Array:
         relative to load / k_n.
     """
     boxes = {"heavy": Box(n=(4, 4)), "light": Box((3.0, 0.0), n=(8, 4))}
-    scene = Beside({name: boxes[name] for name in names}, E=1e3)
+    scene = SceneWithUnrelatedBodies({name: boxes[name] for name in names}, E=1e3)
     load, k = 1e-5, 1e3
     scene.load("light", TOP, 1, scene.bodies.constant(-load))
     scene.load("light", TOP, 0, scene.bodies.constant(0.2 * load))
     if "heavy" in names:
         scene.load("heavy", TOP, 1, scene.bodies.constant(-10.0))
-        scene.hold("heavy", TOP, 0)
+        scene.prescribe("heavy", TOP, 0)
     tags = [scene.tag(name, BOTTOM) for name in names]
     law, options = fc.Coulomb(0.5, k_n=k, k_t=k), {"enforcement": "augmented", "tolerance": 1e-8}
     contact = scene.bodies.contact(tags, FLOOR, law, name="floor", **options)
@@ -359,18 +370,18 @@ def test_multipliers_of_light_and_heavy_body_in_one_contact():
     Augmentations, whose number may differ, end at 1e-8. The largest pressure had an error of
     1.6 %, because the penalty part was compared with the tractions of the heavy body.
     """
-    assert close(_on_multipliers(["heavy", "light"]), _on_multipliers(["light"]), 1e-6)
+    assert is_close(_on_multipliers(["heavy", "light"]), _on_multipliers(["light"]), 1e-6)
 
 
 @pytest.mark.parametrize("method", ["newton", "continuation"])
 def test_displaced_unrelated_body_after_solver_restart(method):
     """Residuals of the displaced body are round-off of its displacement and are accepted."""
-    scene = Beside({"block": Box()}, [BUSY["led aside"]], E=1e3)
+    scene = SceneWithUnrelatedBodies({"block": Box()}, [UNRELATED_BODIES["displaced"]], E=1e3)
     press = scene.bodies.constant()
     scene.load("block", TOP, 1, press)
-    scene.hold("block", LEFT, 0)
+    scene.prescribe("block", LEFT, 0)
     floor = scene.contact("block", BOTTOM, FLOOR, fc.Coulomb(0.3), name="floor")
-    play = Play(scene, setting(press, -0.1, -0.2, -0.3), floor, method=method)
+    play = LoadHistory(scene, setting(press, -0.1, -0.2, -0.3), floor, method=method)
     commit = play.problem.commit
 
     def restarting():
@@ -378,7 +389,7 @@ def test_displaced_unrelated_body_after_solver_restart(method):
         play.problem.restart_solver()
 
     play.problem.commit = restarting
-    assert close(play.run()[0][1], 0.3, 1e-9)
+    assert is_close(play.run()[0][1], 0.3, 1e-9)
 
 
 def test_light_load_with_unrelated_stiff_body():
@@ -387,13 +398,13 @@ def test_light_load_with_unrelated_stiff_body():
     A load is a linear combination of earlier ones only if it is on every body, not just the
     stiffest.
     """
-    scene = Beside({"block": Box(n=(4, 4))}, [BUSY["stiff"]])
+    scene = SceneWithUnrelatedBodies({"block": Box(n=(4, 4))}, [UNRELATED_BODIES["stiff"]])
     press = scene.bodies.constant()
     scene.load("block", TOP, 1, press)
-    scene.hold("block", LEFT, 0)
+    scene.prescribe("block", LEFT, 0)
     floor = scene.contact("block", BOTTOM, FLOOR, fc.Frictionless(), name="floor")
-    play = Play(scene, setting(press, -1e-9, -3e-9, -4e-9), floor)
-    assert close(play.run()[0][1] / 4e-9, 1.0, 1e-6)
+    play = LoadHistory(scene, setting(press, -1e-9, -3e-9, -4e-9), floor)
+    assert is_close(play.run()[0][1] / 4e-9, 1.0, 1e-6)
 
 
 # ---- one contact with several bodies -------------------------------------------------------------
@@ -408,14 +419,14 @@ def test_large_displacement_is_refused_for_each_body_of_a_contact(stiff):
     boxes = {"aside": Box((0.0, 0.0), (1.0, 1.0), (6, 4))}
     if stiff is not None:
         boxes["below"] = Box((0.0, -5.0), (1.0, 1.0), (6, 4), E=stiff)
-    scene = Beside(boxes, E=1.0)
+    scene = SceneWithUnrelatedBodies(boxes, E=1.0)
     aside = scene.bodies.constant(0.0)
-    scene.hold("aside", TOP, 1, value=-0.02)
-    scene.hold("aside", TOP, 0, value=aside)
+    scene.prescribe("aside", TOP, 1, value=-0.02)
+    scene.prescribe("aside", TOP, 0, value=aside)
     tags = [scene.tag("aside", BOTTOM)]
     if stiff is not None:
-        scene.hold("below", BOTTOM, 0)
-        scene.hold("below", BOTTOM, 1, value=0.05)
+        scene.prescribe("below", BOTTOM, 0)
+        scene.prescribe("below", BOTTOM, 1, value=0.05)
         tags.append(scene.tag("below", TOP))
     contact = scene.bodies.contact(tags, fc.Ball((0.5, -2.0), 2.0), fc.Frictionless())
     problem = scene.problem(contact)
@@ -433,11 +444,11 @@ def test_slip_reference_of_each_body_is_its_own_first_touch(kinematics):
     found = []
     for names in (("high",), ("low", "high")):
         boxes = {"low": Box((0.0, 0.001)), "high": Box((3.0, 0.1))}
-        scene = Beside({name: boxes[name] for name in names}, E=1e3)
+        scene = SceneWithUnrelatedBodies({name: boxes[name] for name in names}, E=1e3)
         for name in names:
             down = -0.002 if name == "low" else -0.101
-            scene.hold(name, TOP, 0, value=0.05)
-            scene.hold(name, TOP, 1, value=down)
+            scene.prescribe(name, TOP, 0, value=0.05)
+            scene.prescribe(name, TOP, 1, value=down)
         tags = [scene.tag(name, BOTTOM) for name in names]
         contact = scene.bodies.contact(tags, FLOOR, fc.Coulomb(0.5), kinematics=kinematics)
         scene.problem(contact).solve()
@@ -445,20 +456,20 @@ def test_slip_reference_of_each_body_is_its_own_first_touch(kinematics):
         force = contact.measure[mine] @ contact.traction[mine]
         found.append(np.sum(COMM.allgather(force), axis=0))
     assert abs(found[0][0]) < 0.45 * found[0][1]  # else all slip with any reference
-    assert close(found[1], found[0], 1e-8)
+    assert is_close(found[1], found[0], 1e-8)
 
 
 @pytest.mark.parametrize("beside", [False, True])
 def test_unloading_to_zero_and_reloading(beside):
     """Energies are round-off after unloading; forces are 1, 0, 0 and 1, to 1e-9."""
     boxes = {"block": Box(n=(4, 4))} | ({"other": Box((3.0, 0.0))} if beside else {})
-    scene = Beside(boxes, E=1.0)
+    scene = SceneWithUnrelatedBodies(boxes, E=1.0)
     load = scene.bodies.constant(0.0)
     scene.load("block", TOP, 1, load)
-    scene.hold("block", TOP, 0)
+    scene.prescribe("block", TOP, 0)
     if beside:
-        scene.hold("other", TOP, 0)
-        scene.hold("other", TOP, 1, value=-0.001)
+        scene.prescribe("other", TOP, 0)
+        scene.prescribe("other", TOP, 1, value=-0.001)
     tags = [scene.tag(name, BOTTOM) for name in boxes]
     contact = scene.bodies.contact(tags, FLOOR, fc.Coulomb(0.3))
     problem = scene.problem(contact)
@@ -485,11 +496,11 @@ def test_prescribed_gap_ends_at_the_edge_of_the_opposing_surface():
     }
     forces = []
     for options, steps in (({"kinematics": "finite"}, 20), ({"gap": 0.0}, 1), ({"gap": 0.0}, 20)):
-        scene = Beside(boxes, E=1e5)
+        scene = SceneWithUnrelatedBodies(boxes, E=1e5)
         aside = scene.bodies.constant(0.0)
-        scene.hold("slab", BOTTOM, 0, 1)
-        scene.hold("block", TOP, 0, value=aside)
-        scene.hold("block", TOP, 1, value=-0.002)
+        scene.prescribe("slab", BOTTOM, 0, 1)
+        scene.prescribe("block", TOP, 0, value=aside)
+        scene.prescribe("block", TOP, 1, value=-0.002)
         contact = scene.contact("block", BOTTOM, ("slab", TOP), fc.Coulomb(0.3), **options)
         problem = scene.problem(contact)
         problem.solve()

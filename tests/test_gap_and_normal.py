@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.blocks import BOTTOM, LEFT, RIGHT, TOP, block, block_mesh
-from scenes.comparing import close, gathered, raised_everywhere
+from scenes.comparison import assert_raised_on_all_ranks, gather, is_close
 from scenes.elasticity import displacement_space
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
@@ -60,12 +60,12 @@ def cylinder(x, shift, point, radius, inside, axis=None):
 def check(contact: fc.Contact, reference, shift=0.0) -> None:
     """Check gap, normal and initial gap at all points of all ranks against the reference."""
     contact.evaluate()
-    x = gathered(COMM, contact.points)
+    x = gather(COMM, contact.points)
     gap, normal = reference(x, shift)
-    assert close(gathered(COMM, contact.values.initial_gap), gap, EXACT, scale=1.0)
-    assert close(gathered(COMM, contact.values.normal), normal, EXACT, scale=1.0)
+    assert is_close(gather(COMM, contact.values.initial_gap), gap, EXACT, scale=1.0)
+    assert is_close(gather(COMM, contact.values.normal), normal, EXACT, scale=1.0)
     # With u = 0 the gap is the initial gap (eq. 6).
-    assert close(gathered(COMM, contact.gap), gap, EXACT, scale=1.0)
+    assert is_close(gather(COMM, contact.gap), gap, EXACT, scale=1.0)
 
 
 POINT = {2: (0.2, -0.4), 3: (0.2, 0.1, -0.4)}
@@ -194,9 +194,9 @@ def test_length_of_the_normal_does_not_matter(d):
     one = fc.Contact(u, surface, fc.HalfSpace(POINT[d], SLOPE[d]), law)
     long = fc.Contact(u, surface, fc.HalfSpace(POINT[d], 1e6 * np.array(SLOPE[d])), law)
     for name in ("initial_gap", "normal"):
-        a, b = (gathered(COMM, c.values.arrays[name]) for c in (one, long))
-        assert close(a, b, EXACT, scale=1.0)
-    assert close(np.linalg.norm(gathered(COMM, one.values.normal), axis=1), a[:, 0] * 0 + 1, EXACT)
+        a, b = (gather(COMM, c.values.arrays[name]) for c in (one, long))
+        assert is_close(a, b, EXACT, scale=1.0)
+    assert is_close(np.linalg.norm(gather(COMM, one.values.normal), axis=1), a[:, 0] * 0 + 1, EXACT)
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -208,10 +208,10 @@ def test_common_translation_changes_no_gap(d):
     contact = fc.Contact(u, surface, obstacle, fc.Coulomb(0.3, k_n=1.0, k_t=1.0))
     u.x.array[:] = np.tile(shift, u.x.array.size // d)
     contact.evaluate()
-    gap, _ = half_space(gathered(COMM, contact.points), 0.0, POINT[d], SLOPE[d])
-    assert close(gathered(COMM, contact.gap), gap, EXACT, scale=1.0)
-    jump = gathered(COMM, contact.tangential_displacement)
-    assert close(jump, 0 * jump, EXACT, scale=1.0)
+    gap, _ = half_space(gather(COMM, contact.points), 0.0, POINT[d], SLOPE[d])
+    assert is_close(gather(COMM, contact.gap), gap, EXACT, scale=1.0)
+    jump = gather(COMM, contact.tangential_displacement)
+    assert is_close(jump, 0 * jump, EXACT, scale=1.0)
 
 
 def test_initial_penetration_is_reported(caplog):
@@ -224,9 +224,9 @@ def test_initial_penetration_is_reported(caplog):
     disc = fc.Ball((0.5, 0.125 - 2.0), 2.0)
     with caplog.at_level(logging.WARNING, logger="fenics_contact"):
         problem, contact = scene.problem(
-            fc.Frictionless(k_n=1e3), [scene.hold(LEFT, 0)], contact={"obstacle": disc}
+            fc.Frictionless(k_n=1e3), [scene.dirichlet_bc(LEFT, 0)], contact={"obstacle": disc}
         )
-    x = gathered(COMM, contact.points)
+    x = gather(COMM, contact.points)
     deepest = (2.0 - np.linalg.norm(x - [0.5, -1.875], axis=1)).max()
     assert 0.1 < deepest < 0.125
     assert abs(problem.initial_penetration - deepest) <= EXACT
@@ -274,7 +274,7 @@ def test_touching_body_has_no_initial_penetration(caplog):
 def test_bad_obstacle_in_the_plane_is_refused(obstacle, words):
     """The error names data of the wrong dimension, of length zero, or not finite."""
     surface, u = scene(2)
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: fc.Contact(u, surface, obstacle, fc.Frictionless(k_n=1.0)), ValueError, *words
     )
 
@@ -292,7 +292,7 @@ def test_bad_obstacle_in_the_plane_is_refused(obstacle, words):
 def test_bad_obstacle_in_space_is_refused(obstacle, words):
     """The error names data of the wrong dimension, and a missing or zero axis of a cylinder."""
     surface, u = scene(3)
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: fc.Contact(u, surface, obstacle, fc.Frictionless(k_n=1.0)), ValueError, *words
     )
 
@@ -300,18 +300,20 @@ def test_bad_obstacle_in_space_is_refused(obstacle, words):
 def test_only_displacement_of_an_obstacle_causes_friction():
     """Motion along Γc by ``displacement`` causes friction; by point or gap it does not."""
     force = {}
-    for way in ("displacement", "point", "gap"):
+    for formulation in ("displacement", "point", "gap"):
         made = block("quadrilateral", n=4)
         motion, up = fem.Constant(made.mesh, np.zeros(2)), np.array([0.0, 1.0])
-        place = motion if way == "point" else np.zeros(2)
-        obstacle = fc.HalfSpace(place, up, displacement=motion if way == "displacement" else None)
-        gap = -ufl.dot(motion, ufl.as_vector(up)) if way == "gap" else None
-        held = [made.hold(TOP, i) for i in range(2)]
+        place = motion if formulation == "point" else np.zeros(2)
+        obstacle = fc.HalfSpace(
+            place, up, displacement=motion if formulation == "displacement" else None
+        )
+        gap = -ufl.dot(motion, ufl.as_vector(up)) if formulation == "gap" else None
+        held = [made.dirichlet_bc(TOP, i) for i in range(2)]
         law, contact = fc.Coulomb(0.3), {"obstacle": obstacle, "gap": gap}
         problem, contact = made.problem(law, held, contact=contact)
         motion.value[:] = 0.01, 0.01
         problem.solve()
-        force[way] = contact.resultants().force
+        force[formulation] = contact.resultants().force
     assert force["displacement"][0] > 0.2 * force["displacement"][1]
-    assert close(force["gap"], force["point"], 1e-9)
+    assert is_close(force["gap"], force["point"], 1e-9)
     assert abs(force["gap"][0]) < 1e-8 * force["gap"][1]

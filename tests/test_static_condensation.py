@@ -14,18 +14,18 @@ from fenics_contact.systems.candidate_dofs import find_coupled_dofs
 from fenics_contact.systems.condensation import Condensation
 from fenics_contact.systems.condensed import is_worthwhile
 from fenics_contact.systems.unknowns import DofSubset
+from scenes.block_on_ball import PATH, BlockOnBall, solve_path, supporting_ball
 from scenes.blocks import CELLS, GRID, LEFT, RIGHT, TOP, block, kirchhoff
-from scenes.comparing import (
-    at_points,
-    close,
-    gathered,
-    nodal,
-    owned,
-    raised_everywhere,
-    same_effort,
+from scenes.comparison import (
+    assert_raised_on_all_ranks,
+    gather,
+    have_similar_iterations,
+    is_close,
+    nodal_values,
+    owned_values,
+    point_values,
 )
-from scenes.rubbing import PATH, Rub, cushion, walk
-from scenes.two_blocks import Slider
+from scenes.two_blocks import SlidingBlock
 
 pytestmark = [pytest.mark.timeout(240), pytest.mark.three_ranks]
 COMM = MPI.COMM_WORLD
@@ -44,7 +44,7 @@ def assert_same(condensed, whole, rtol=SAME):
     for name, value in whole.items():
         # Slip is a difference of displacements.
         scale = float(np.abs(whole["u"] if name == "slip" else value).max(initial=1e-300))
-        assert close(condensed[name], value, rtol, scale=scale), name
+        assert is_close(condensed[name], value, rtol, scale=scale), name
 
 
 # ---- the Schur complement ------------------------------------------------------------------------
@@ -55,7 +55,7 @@ def dense(matrix):
     pointers, columns, values = matrix.getValuesCSR()
     result = np.zeros((pointers.size - 1, matrix.getSize()[1]))
     result[np.repeat(np.arange(len(result)), np.diff(pointers)), columns] = values
-    return gathered(COMM, result)
+    return gather(COMM, result)
 
 
 @pytest.mark.parametrize("symmetric", [True, False])
@@ -69,7 +69,7 @@ def test_schur_complement(cell, degree, symmetric):
         turn[0, 1], turn[1, 0] = 300.0, -300.0
         scene.F += ufl.dot(fem.Constant(scene.mesh, turn) * scene.u, v) * ufl.dx(scene.mesh)
     aside = fem.Constant(scene.mesh, 0.01)
-    bcs = [scene.hold(LEFT, i, aside) for i in range(scene.dim)]
+    bcs = [scene.dirichlet_bc(LEFT, i, aside) for i in range(scene.dim)]
     problem, _ = scene.problem(fc.Frictionless(), bcs)
     assert problem.full.bulk.symmetric == symmetric
     K = dense(problem.full.bulk.stiffness)
@@ -85,7 +85,7 @@ def test_schur_complement(cell, degree, symmetric):
         mine[dofs[dofs < whole.n_local]] = True
     selection = DofSubset(whole, touches)
     made = Condensation(problem.full.bulk.stiffness, problem.full.bulk, selection, mine)
-    held, kept = gathered(COMM, mine) > 0.5, gathered(COMM, whole.first + touches)
+    held, kept = gather(COMM, mine) > 0.5, gather(COMM, whole.first + touches)
     assert np.array_equal(kept, selection.numbers)
     inside = np.setdiff1d(np.flatnonzero(~held), kept)
     inverse = np.linalg.inv(K[np.ix_(inside, inside)])
@@ -93,7 +93,7 @@ def test_schur_complement(cell, degree, symmetric):
     schur = K[np.ix_(kept, kept)] - away @ K[np.ix_(inside, kept)]
     first = COMM.rank == 0
     assert made.schur.shape == ((kept.size, kept.size) if first else (0, 0))
-    assert not first or close(made.schur, schur, 1e-10)
+    assert not first or is_close(made.schur, schur, 1e-10)
 
     def part(values):
         return values[whole.first : whole.first + whole.n_local].copy()
@@ -109,13 +109,13 @@ def test_schur_complement(cell, degree, symmetric):
         prescribed = np.where(held & ~np.isin(np.arange(n), kept), state, 0.0)
         lifted = force - K @ prescribed
         load = lifted[kept] - away @ lifted[inside]
-        assert not first or close(made.particular.load, load, 1e-10)
+        assert not first or is_close(made.particular.load, load, 1e-10)
         field = prescribed + 0.0
         field[kept] = state[kept]
         field[inside] = inverse @ (force - K @ field)[inside]
         given = state[kept] if first else np.zeros(0)
-        found = gathered(COMM, made.particular.field + made.extend(given))
-        assert close(found, field, 1e-10)
+        found = gather(COMM, made.particular.field + made.extend(given))
+        assert is_close(found, field, 1e-10)
 
 
 def test_singular_interior_stiffness_is_refused():
@@ -126,7 +126,7 @@ def test_singular_interior_stiffness_is_refused():
     free = np.zeros(problem.full.unknowns.n_local, dtype=bool)
     scene.E.value = 0.0
     problem.full.bulk.update()
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: Condensation(problem.full.bulk.stiffness, problem.full.bulk, none, free),
         RuntimeError,
         "singular",
@@ -139,7 +139,11 @@ def test_singular_interior_stiffness_is_refused():
 def fields(made, steps=()):
     """Return the final state, and forces and energies of the increments."""
     contact = made.contact
-    found = {"u": owned(made.scene.u).copy(), "traction": contact.traction, "slip": contact.slip}
+    found = {
+        "u": owned_values(made.scene.u).copy(),
+        "traction": contact.traction,
+        "slip": contact.slip,
+    }
     found["force"] = np.array([s.contacts["contact"].force for s in steps])
     found["work"] = np.array([[s.energy.work, s.energy.elastic] for s in steps])
     return found
@@ -165,14 +169,14 @@ def test_load_path(cell, degree, law, method):
     iterations = {}
 
     def run(made):
-        steps = walk(made)
+        steps = solve_path(made)
         iterations[made.problem.solver.condensed] = sum(s.iterations for s in steps)
         if made.problem.solver.condensed:
             assert [s.factorisations for s in steps] == [1, 0, 0, 0, 0, 0]
         return fields(made, steps)
 
     def make(**options):
-        return Rub(LAWS[law], cell=cell, degree=degree, method=method, **options)
+        return BlockOnBall(LAWS[law], cell=cell, degree=degree, method=method, **options)
 
     assert_same(*both(make, run))
     assert iterations[True] <= 1.5 * iterations[False]
@@ -184,9 +188,9 @@ def test_every_cell(cell, degree):
     mesh = {"n": 4 if cell in ("triangle", "quadrilateral") else 2}
 
     def make(**options):
-        return Rub(cell=cell, degree=degree, mesh=mesh, **options)
+        return BlockOnBall(cell=cell, degree=degree, mesh=mesh, **options)
 
-    assert_same(*both(make, lambda made: fields(made, walk(made, path=PATH[:4]))))
+    assert_same(*both(make, lambda made: fields(made, solve_path(made, path=PATH[:4]))))
 
 
 @pytest.mark.parametrize("cell", CELLS)
@@ -196,13 +200,13 @@ def test_deformable_obstacle(cell):
     results = []
     for condensed in (True, False):
         law = fc.Coulomb(0.3, k_n=1e7, k_t=1e7)
-        made = Slider(cell, law, start=0.4, n=n, condensation=condensed)
+        made = SlidingBlock(cell, law, start=0.4, n=n, condensation=condensed)
         steps = [made.step(0.002, along) for along in (0.0, 0.3, 0.6)]
         results.append(
             {
                 # Sorted by position, since the partition may differ between the two meshes.
-                "u": nodal(made.u),
-                "traction": at_points(made.contact, made.contact.traction),
+                "u": nodal_values(made.u),
+                "traction": point_values(made.contact, made.contact.traction),
                 "force": np.array([s.contacts["contact"].force for s in steps]),
             }
         )
@@ -225,8 +229,8 @@ def test_driven_obstacle(cell, method):
         )
         problem, contact = scene.problem(
             fc.Coulomb(0.3, k_n=2e4, k_t=1e4),
-            [scene.hold(TOP, i) for i in range(d)],
-            contact={"obstacle": cushion(d, motion)},
+            [scene.dirichlet_bc(TOP, i) for i in range(d)],
+            contact={"obstacle": supporting_ball(d, motion)},
             method=method,
             condensation=condensed,
         )
@@ -235,7 +239,7 @@ def test_driven_obstacle(cell, method):
             problem.commit()
         up = float(contact.free_motion[d - 1].value)
         results.append(
-            {"u": owned(scene.u).copy(), "up": np.array([up]), "traction": contact.traction}
+            {"u": owned_values(scene.u).copy(), "up": np.array([up]), "traction": contact.traction}
         )
     assert_same(*results)
 
@@ -245,7 +249,7 @@ def test_several_contacts_and_loads():
     results = []
     for condensed in (True, False):
         scene = block("triangle", 2, n=4)
-        side = scene.pull(RIGHT, scene.vector(side=-1.0))
+        side = scene.add_traction(RIGHT, scene.vector(side=-1.0))
         wall = scene.wall(fc.Frictionless(k_n=2e4))
         floor = scene.contact(fc.Coulomb(0.2, k_n=2e4, k_t=1e4), name="floor")
         problem = fc.ContactProblem(
@@ -261,7 +265,7 @@ def test_several_contacts_and_loads():
         # The loads are combinations of two fields, so that two solutions suffice.
         if condensed:
             assert len(problem.solver.system.condensation.load_directions) == 2
-        results.append({"u": owned(scene.u).copy(), "forces": np.array(found)})
+        results.append({"u": owned_values(scene.u).copy(), "forces": np.array(found)})
     assert_same(*results)
 
 
@@ -272,12 +276,12 @@ def test_changed_modulus_is_factored_anew():
         steps = []
         for E, move in zip((1000.0, 2000.0, 2000.0, 500.0), PATH[:4], strict=True):
             made.scene.E.value = E
-            steps += walk(made, path=[move])
+            steps += solve_path(made, path=[move])
         if made.problem.solver.condensed:
             assert [s.factorisations for s in steps] == [1, 1, 0, 1]
         return fields(made, steps)
 
-    assert_same(*both(Rub, run))
+    assert_same(*both(BlockOnBall, run))
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -285,26 +289,28 @@ def test_results_do_not_depend_on_units(method):
     """Number of iterations and fields are the same in other units, fields to 1e-9."""
     results = []
     for length, pressure in [(1.0, 1.0), (1e-3, 1e6), (1e-9, 1e9)]:
-        made = Rub(
+        made = BlockOnBall(
             fc.Coulomb(0.3), length=length, pressure=pressure, method=method, condensation=True
         )
-        steps = walk(made, length, PATH[:4])
+        steps = solve_path(made, length, PATH[:4])
         iterations = [s.iterations for s in steps]
-        results.append((iterations, owned(made.scene.u) / length, made.contact.traction / pressure))
+        results.append(
+            (iterations, owned_values(made.scene.u) / length, made.contact.traction / pressure)
+        )
     for iterations, u, traction in results[1:]:
-        assert same_effort(iterations, results[0][0])
-        assert close(u, results[0][1], 1e-9)
-        assert close(traction, results[0][2], 1e-9)
+        assert have_similar_iterations(iterations, results[0][0])
+        assert is_close(u, results[0][1], 1e-9)
+        assert is_close(traction, results[0][2], 1e-9)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_failed_increment_changes_nothing(method):
     """A failed increment changes neither u, nor the history, nor the following increments."""
-    made, twin = (Rub(method=method, condensation=True) for _ in range(2))
+    made, twin = (BlockOnBall(method=method, condensation=True) for _ in range(2))
     for m in (made, twin):
-        walk(m, path=PATH[:2])
+        solve_path(m, path=PATH[:2])
     before = made.scene.u.x.array.copy(), made.contact.history.function.x.array.copy()
-    made.move(*PATH[2])
+    made.set_top_displacement(*PATH[2])
     kept = made.problem.solver.main.max_it
     made.problem.solver.main.max_it = 0
     made.problem.snes.setTolerances(max_it=0)
@@ -315,7 +321,7 @@ def test_failed_increment_changes_nothing(method):
     after = made.scene.u.x.array, made.contact.history.function.x.array
     assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
     for m in (made, twin):
-        walk(m, path=PATH[2:])
+        solve_path(m, path=PATH[2:])
     assert_same(fields(made), fields(twin))
 
 
@@ -331,7 +337,7 @@ def test_indefinite_bulk():
             fc.Frictionless(k_n=5e3), scene.rollers(), condensation=condensed, petsc_options=TIGHT
         )
         problem.solve()
-        results.append({"u": owned(scene.u).copy(), "pressure": contact.pressure})
+        results.append({"u": owned_values(scene.u).copy(), "pressure": contact.pressure})
     assert_same(*results)
 
 
@@ -358,14 +364,16 @@ def test_default_of_condensation_is_logged(caplog):
     options = PETSc.Options().getAll()
 
     def without_contact():
-        bcs = [scene.hold(LEFT, i) for i in range(2)]
+        bcs = [scene.dirichlet_bc(LEFT, i) for i in range(2)]
         fc.ContactProblem(scene.F, scene.u, bcs=bcs, condensation=True)
 
-    raised_everywhere(without_contact, ValueError, "condensation", "no contact")
+    assert_raised_on_all_ranks(without_contact, ValueError, "condensation", "no contact")
     F = kirchhoff(scene)
-    raised_everywhere(lambda: condensed(F, [contact]), ValueError, "condensation", "not linear")
+    assert_raised_on_all_ranks(
+        lambda: condensed(F, [contact]), ValueError, "condensation", "not linear"
+    )
     given = {"pc_type": "lu"}
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: condensed(scene.F, [contact], petsc_options=given), ValueError, "pc_type"
     )
     assert PETSc.Options().getAll() == options

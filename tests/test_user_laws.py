@@ -16,9 +16,9 @@ from fenics_contact.laws.base import ContactTraction, Law
 from fenics_contact.laws.friction import FrictionLaw
 from fenics_contact.laws.return_maps import positive_part
 from scenes.blocks import TOP, block
-from scenes.comparing import close, gathered, raised_everywhere
+from scenes.comparison import assert_raised_on_all_ranks, gather, is_close
 from scenes.elasticity import stress
-from scenes.laws import Asperities, Bond, Overclosure, Saturating
+from scenes.user_laws import Adhesive, AsperityFriction, Overclosure, SaturatingFriction
 
 COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.mpi, pytest.mark.timeout(120)]
@@ -50,16 +50,16 @@ def test_overclosure(cell, method, condensation):
         scene.load(up=-p)
         step = problem.solve()
         assert step.verdict.failures == []
-        assert close(gathered(COMM, contact.pressure), np.full_like(_ones(contact), p), EXACT)
-        overclosure = -gathered(COMM, contact.gap)
-        assert close(overclosure, H * np.log(p / P0) * _ones(contact), EXACT, scale=H)
+        assert is_close(gather(COMM, contact.pressure), np.full_like(_ones(contact), p), EXACT)
+        overclosure = -gather(COMM, contact.gap)
+        assert is_close(overclosure, H * np.log(p / P0) * _ones(contact), EXACT, scale=H)
         problem.commit()
     # For a nonlinear law the trapezoidal work is inexact; the energy of its springs is exact.
     assert step.energy.springs == pytest.approx(H * (20.0 - 3.0), rel=1e-6)
 
 
 def _ones(contact):
-    return np.ones(len(gathered(COMM, contact.pressure)))
+    return np.ones(len(gather(COMM, contact.pressure)))
 
 
 @pytest.mark.parametrize("condensation", [None, False])
@@ -71,16 +71,18 @@ def test_softening_adhesive_is_unloaded(cell, condensation):
     The tension is k o exp(-o/h) = p at every point, to 1e-7 of the forces, and zero without load.
     """
     scene = block(cell, E=E, nu=NU)
-    bond = Bond(k_n=1e3, h=1e-2)
+    bond = Adhesive(k_n=1e3, h=1e-2)
     problem, contact = scene.problem(bond, scene.rollers(), condensation=condensation)
     for pull in (1.0, 0.5 * bond.strength, 0.0, 0.0, 1.0, 0.0):
         scene.load(up=pull)
         step = problem.solve()
         assert step.verdict.failures == []
         problem.commit()
-        assert close(-gathered(COMM, contact.pressure), pull * _ones(contact), EXACT, scale=1.0)
-        opening = gathered(COMM, contact.gap)
-        assert close(1e3 * opening * np.exp(-opening / 1e-2), pull * _ones(contact), EXACT, scale=1)
+        assert is_close(-gather(COMM, contact.pressure), pull * _ones(contact), EXACT, scale=1.0)
+        opening = gather(COMM, contact.gap)
+        assert is_close(
+            1e3 * opening * np.exp(-opening / 1e-2), pull * _ones(contact), EXACT, scale=1
+        )
 
 
 def test_newton_recovers_from_a_step_that_is_too_deep():
@@ -109,8 +111,8 @@ def test_any_units():
         scene = block("quadrilateral", E=E * force, nu=NU, up=-3.0 * force, size=size)
         problem, contact = scene.problem(Overclosure(P0 * force, H * length), scene.rollers())
         problem.solve()
-        found.append(-gathered(COMM, contact.gap) / length)
-    assert close(found[1], found[0], EXACT) and close(found[2], found[0], EXACT)
+        found.append(-gather(COMM, contact.gap) / length)
+    assert is_close(found[1], found[0], EXACT) and is_close(found[2], found[0], EXACT)
 
 
 @pytest.mark.each
@@ -125,10 +127,10 @@ def test_overclosure_with_friction(cell, method, condensation):
     mu = 0.3
     scene = block(cell, E=E, nu=NU, n=3)
     d = scene.dim
-    push, press = (scene.hold(TOP, i) for i in (0, d - 1))
-    held = [scene.hold(TOP, 1)] if d == 3 else []
+    push, press = (scene.dirichlet_bc(TOP, i) for i in (0, d - 1))
+    held = [scene.dirichlet_bc(TOP, 1)] if d == 3 else []
     problem, contact = scene.problem(
-        Asperities(mu, P0, H, fc.RelativeStiffness()),
+        AsperityFriction(mu, P0, H, fc.RelativeStiffness()),
         [push, press, *held],
         method=method,
         condensation=condensation,
@@ -137,9 +139,9 @@ def test_overclosure_with_friction(cell, method, condensation):
         push.g.value[...], press.g.value[...] = side, -down
         step = problem.solve()
         assert step.verdict.failures == []
-        penetration = np.maximum(-gathered(COMM, contact.gap), 0.0)
+        penetration = np.maximum(-gather(COMM, contact.gap), 0.0)
         expected = P0 * (np.exp(penetration / H) - 1)
-        assert close(gathered(COMM, contact.pressure), expected, 1e-10)
+        assert is_close(gather(COMM, contact.pressure), expected, 1e-10)
         if side:
             r = step.contacts["contact"]
             assert r.stick == 0
@@ -153,8 +155,8 @@ def dragged(law, cell="quadrilateral", **options):
     """Return a block pressed on a plane by its top and dragged until all points slip."""
     scene = block(cell, E=E, nu=NU, n=3)
     d = scene.dim
-    push, press = (scene.hold(TOP, i) for i in (0, d - 1))
-    held = [scene.hold(TOP, 1)] if d == 3 else []
+    push, press = (scene.dirichlet_bc(TOP, i) for i in (0, d - 1))
+    held = [scene.dirichlet_bc(TOP, 1)] if d == 3 else []
     problem, contact = scene.problem(law, [push, press, *held], **options)
     push.g.value[...], press.g.value[...] = 4e-2, -2e-2
     return scene, problem, contact
@@ -166,13 +168,13 @@ def dragged(law, cell="quadrilateral", **options):
 def test_friction_bound_nonlinear_in_the_pressure(cell, method, condensation):
     """All points slip: |τ| is the friction bound at their pressure, to the solver's 1e-9."""
     mu, strength = 0.5, 4.0
-    law = Saturating(mu, strength, fc.RelativeStiffness(), fc.RelativeStiffness())
+    law = SaturatingFriction(mu, strength, fc.RelativeStiffness(), fc.RelativeStiffness())
     _, problem, contact = dragged(law, cell, method=method, condensation=condensation)
     step = problem.solve()
     assert step.verdict.failures == [] and step.contacts["contact"].stick == 0
-    p, tau = (gathered(COMM, v) for v in (contact.pressure, contact.tangential_traction))
+    p, tau = (gather(COMM, v) for v in (contact.pressure, contact.tangential_traction))
     assert mu * p.max() > 2 * strength  # far from Coulomb's law
-    assert close(np.linalg.norm(tau, axis=1), strength * (1 - np.exp(-mu * p / strength)), 1e-9)
+    assert is_close(np.linalg.norm(tau, axis=1), strength * (1 - np.exp(-mu * p / strength)), 1e-9)
 
 
 def test_enforcement_error_uses_the_derivative_of_the_friction_bound():
@@ -183,7 +185,9 @@ def test_enforcement_error_uses_the_derivative_of_the_friction_bound():
     """
     found = []
     for factor in (3.0, 3e3):
-        law = Saturating(0.5, 4.0, fc.RelativeStiffness(factor), fc.RelativeStiffness(factor))
+        law = SaturatingFriction(
+            0.5, 4.0, fc.RelativeStiffness(factor), fc.RelativeStiffness(factor)
+        )
         scene, problem, _ = dragged(law)
         problem.solve()
         budget = fc.estimate_errors(problem, stress(scene.u, E, NU))
@@ -200,7 +204,7 @@ def test_enforcement_error_uses_the_derivative_of_the_friction_bound():
 def test_multipliers_are_refused():
     """Multipliers would remove the stiffness that the law describes: they are refused."""
     scene = block()
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: scene.contact(Overclosure(P0, H), enforcement="augmented"),
         ValueError,
         "Overclosure",
@@ -220,10 +224,10 @@ def test_incomplete_laws_are_refused():
             return ContactTraction(-parameters["p0"] * positive_part(-kinematics.gap) ** 2)
 
     scene = block()
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: scene.contact(Silent(1.0)), ValueError, "contact", "Silent", "normal_potential"
     )
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: scene.contact(Law()), ValueError, "contact", "Law", "contact_traction"
     )
 
@@ -235,7 +239,7 @@ def test_incomplete_laws_are_refused():
         def contact_traction(self, kinematics, parameters):
             return None
 
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: scene.contact(Slippery(0.3, 1.0)), ValueError, "contact", "Slippery", "k_t"
     )
 
@@ -259,7 +263,7 @@ def test_inconsistent_potential_is_caught():
 def test_inconsistent_friction_bound_is_caught():
     """The verdict detects a traction with another friction bound than `Law.friction_bound`."""
 
-    class Wrong(Saturating):
+    class Wrong(SaturatingFriction):
         """A law that slips at the bound of another strength than that of its parameters."""
 
         def contact_traction(self, kinematics, parameters):
@@ -306,17 +310,19 @@ def test_non_finite_derivative_is_refused(condensation):
         condensation=condensation,
     )
     scene.load(up=-0.2)
-    text = raised_everywhere(problem.solve, fc.NotConverged, "not finite", "user-defined law")
+    text = assert_raised_on_all_ranks(
+        problem.solve, fc.NotConverged, "not finite", "user-defined law"
+    )
     assert "its size" not in text  # NaN does not count as deformation
     assert problem.increment == 0 and np.all(scene.u.x.array == 0.0)
-    assert np.isfinite(gathered(COMM, contact.gap)).all()
+    assert np.isfinite(gather(COMM, contact.gap)).all()
 
 
 def test_remedies_name_the_stiffnesses_of_the_law():
     """A lower k_n or k_t is suggested only if the law has this parameter."""
     for law, words in (
         (
-            Asperities(0.3, P0, H, fc.RelativeStiffness()),
+            AsperityFriction(0.3, P0, H, fc.RelativeStiffness()),
             "Try smaller increments, then a lower k_t;",
         ),
         (Overclosure(P0, H), "Try smaller increments;"),
@@ -338,7 +344,7 @@ def test_unknown_parameter_is_refused():
         def friction_bound(self, kinematics, pressure, parameters):
             return ufl.min_value(parameters["friction"] * pressure, parameters["capp"])
 
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: block().contact(Capped(0.3)),
         ValueError,
         "Capped",
@@ -354,7 +360,7 @@ def test_parameter_with_a_name_of_the_contact_is_refused():
     class Weighed(Overclosure):
         weight: Any = 1.0
 
-    raised_everywhere(
+    assert_raised_on_all_ranks(
         lambda: block().contact(Weighed(P0, H)), ValueError, "contact", "Weighed", "'weight'"
     )
 
@@ -364,7 +370,7 @@ def test_invalid_parameters_of_a_user_defined_law_are_refused(name, value):
     """Parameters of a user-defined law are checked as those of the package's laws."""
     scene = block()
     law = replace(Overclosure(P0, H), **{name: value})
-    raised_everywhere(lambda: scene.contact(law), ValueError, "contact", name)
+    assert_raised_on_all_ranks(lambda: scene.contact(law), ValueError, "contact", name)
 
 
 @dataclass(frozen=True)
@@ -392,4 +398,6 @@ def test_dependence_on_other_than_parameters_is_refused():
     x = ufl.SpatialCoordinate(scene.mesh)
     for hidden in (x[0], scene.u[0] ** 2, fem.Constant(scene.mesh, 0.1)):
         law = Beside(k_n=1e3, hidden=hidden)
-        raised_everywhere(lambda law=law: scene.contact(law), ValueError, "Beside", "parameter")
+        assert_raised_on_all_ranks(
+            lambda law=law: scene.contact(law), ValueError, "Beside", "parameter"
+        )
