@@ -21,12 +21,12 @@ def main() -> None:
     arguments = parser(__doc__, "adaptation").parse_args()
     rows = []
     for friction in (0.0, 0.3):
-        for refinement, share, levels in (("uniform", 1.0, 5), ("adaptive", 0.5, 10)):
+        for refinement, bulk_fraction, levels in (("uniform", 1.0, 5), ("adaptive", 0.5, 10)):
             if arguments.short:
                 levels -= 2
             steps = 4 if friction else 1
             solve = partial(solve_indentation, friction=friction, steps=steps)
-            for level in fc.adapt(*half_block(4), solve, levels=levels, share=share):
+            for level in fc.adapt(*half_block(4), solve, levels=levels, share=bulk_fraction):
                 row = {"μ": friction, "refinement": refinement, "dofs": level.dofs}
                 row["error of the energy norm"] = level.budget.energy
                 rows.append(row | level.budget.values)

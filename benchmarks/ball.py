@@ -28,8 +28,8 @@ from scenes import problems
 def runs(case: costs.Case, friction: float) -> dict[str, Callable[[], costs.Row]]:
     """Return the runs to time, by name."""
     return {
-        costs.YARDSTICK: case.linear,
-        f"{costs.YARDSTICK}, multigrid": partial(case.linear, "multigrid"),
+        costs.REFERENCE_RUN: case.linear,
+        f"{costs.REFERENCE_RUN}, multigrid": partial(case.linear, "multigrid"),
         "by default": partial(case.package, friction),
         "condensed": partial(case.package, friction, condensation=True),
         "all dofs, L-BFGS, multigrid": partial(

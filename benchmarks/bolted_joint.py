@@ -32,9 +32,9 @@ from scenes.problems import n_dofs
 from scenes.processes import run_json
 
 COMM = MPI.COMM_WORLD
-TIGHT, PULLED = 1.0, 3.0  # load parameter at the end of preload and pull
+PRELOAD_END, PULL_END = 1.0, 3.0  # load parameter at the end of preload and pull
 INCREMENT = 0.5
-BEYOND = 1.05  # relative to the friction limit
+OVERLOAD_RATIO = 1.05  # relative to the friction limit
 Row = timing.Row
 
 
@@ -58,7 +58,7 @@ def _now() -> float:
     return time.perf_counter()
 
 
-def child(size: float, degree: int, repeat: int) -> None:
+def run_in_process(size: float, degree: int, repeat: int) -> None:
     """Solve all increments, and print their rows as JSON, the last line of rank 0."""
     for _ in joint.BoltedJoint(8.0, degree=degree).increments(INCREMENT, steps=1):
         pass  # compiles the forms
@@ -67,7 +67,7 @@ def child(size: float, degree: int, repeat: int) -> None:
     common = {"dofs": n_dofs(made.u.function_space), "ranks": COMM.size}
     rows: list[Row] = []
     start = _now()
-    for step in made.increments(PULLED, steps=round(PULLED / INCREMENT)):
+    for step in made.increments(PULL_END, steps=round(PULL_END / INCREMENT)):
         seconds = _now() - start
         preload = made.pull.value == 0.0
         what = "preload" if preload else f"pull {float(made.pull.value):g} N"
@@ -76,7 +76,7 @@ def child(size: float, degree: int, repeat: int) -> None:
         start = _now()
     plates, head, _ = (contact.resultants() for contact in made.contacts)
     limit = joint.FRICTION * (plates.normal_force + head.normal_force)
-    made.load(TIGHT + BEYOND * limit / 1000.0)
+    made.load(PRELOAD_END + OVERLOAD_RATIO * limit / 1000.0)
     start = _now()
     try:
         step = made.problem.solve()
@@ -101,7 +101,7 @@ def main() -> None:
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.child:
-        child(arguments.size[0], arguments.degree, arguments.repeat)
+        run_in_process(arguments.size[0], arguments.degree, arguments.repeat)
         return
     degree = 1 if arguments.short else arguments.degree
     rows: list[Row] = []

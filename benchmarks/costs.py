@@ -26,14 +26,14 @@ from fenics_contact.systems import linear
 from scenes import problems
 from scenes.elasticity import dirichlet_bc
 
-YARDSTICK = "one linear solve"
+REFERENCE_RUN = "one linear solve"
 # Suffix of the names of histories with ``recover_interior="last"``.
-AT_END = ", interior at the end"
+LAST_INTERIOR = ", interior at the end"
 PLAIN = {"direct": "plain DOLFINx, LU", "multigrid": "plain DOLFINx, GMRES + GAMG"}
 # Residual relative to the forces in all runs; the default of the package.
 TOLERANCE = 1e-9
 # Runs that take longer are not repeated (s).
-ONCE = 30.0
+MAX_REPEATED_TIME = 30.0
 Row = timing.Row
 
 _FORWARD = (PETSc.InsertMode.INSERT, PETSc.ScatterMode.FORWARD)
@@ -279,7 +279,7 @@ def runs(
         histories: Numbers of increments of the runs with friction.
         all_unknowns: Whether several increments are also solved on all dofs, which takes minutes.
     """
-    found: dict[str, Callable[[], Row]] = {YARDSTICK: case.linear}
+    found: dict[str, Callable[[], Row]] = {REFERENCE_RUN: case.linear}
     variants: dict[str, dict[str, Any]] = {
         "by default": {},
         "condensed, L-BFGS": {"condensation": True, "method": "lbfgs"},
@@ -297,7 +297,7 @@ def runs(
                 fields += ["last"] * (steps > 1)
                 for field in fields:
                     run = f"{name}, {steps} increments: {variant}"
-                    run += AT_END if field == "last" else ""
+                    run += LAST_INTERIOR if field == "last" else ""
                     found[run] = partial(case.package, friction, steps, field, **options)
     return found
 
@@ -332,16 +332,16 @@ def study(
     for size, make in cases.items():
         case = make()
         only = arguments.only
-        chosen = {n: run for n, run in choose(case).items() if only in n or n == YARDSTICK}
+        chosen = {n: run for n, run in choose(case).items() if only in n or n == REFERENCE_RUN}
         rows = timing.measure(
-            chosen, repeat=arguments.repeat, first=None if waits else chosen, once=ONCE
+            chosen, repeat=arguments.repeat, first=None if waits else chosen, once=MAX_REPEATED_TIME
         )
         waits = waits or {row["run"]: row.pop("first run [s]") for row in rows}
-        rows = timing.in_units_of(rows, YARDSTICK, "linear solves")
+        rows = timing.in_units_of(rows, REFERENCE_RUN, "linear solves")
         if size == list(cases)[-1]:
             rows = [row | {"first run [s]": waits[row["run"]]} for row in rows]
             heading = f"{title}: {case.n_dofs} dofs, {case.n_contact_dofs} on Γc"
-            heading += f", medians of {arguments.repeat} (one run above {ONCE:g} s)"
+            heading += f", medians of {arguments.repeat} (one run above {MAX_REPEATED_TIME:g} s)"
             timing.write(arguments.output, name, heading, rows)
         sizes = {"size": size, "dofs": case.n_dofs, "contact dofs": case.n_contact_dofs}
         everything += [sizes | row for row in rows]

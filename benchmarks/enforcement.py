@@ -38,24 +38,24 @@ NITSCHE = {
     "Nitsche 10 incomplete": (10.0, 0.0),
     "Nitsche 100 incomplete": (100.0, 0.0),
 }
-YARDSTICK = "penalty 10"
+REFERENCE_RUN = "penalty 10"
 # Runs that take longer are not repeated (s).
-ONCE = 5.0
+MAX_REPEATED_TIME = 5.0
 
 
 @dataclass
-class Found:
+class SurfaceSolution:
     """A solution on Γc: coordinates, pressure, penetration, friction force, quadrature weights."""
 
     displacement: float
     x: Array
     pressure: Array
     penetration: float
-    shear: float
+    friction_force: float
     measure: Array
     iterations: int
 
-    def row(self, reference: Found) -> timing.Row:
+    def row(self, reference: SurfaceSolution) -> timing.Row:
         """Return the row of the table."""
         order = np.argsort(reference.x)
         exact = np.interp(self.x, reference.x[order], reference.pressure[order])
@@ -66,26 +66,26 @@ class Found:
             "peak pressure error": abs(self.pressure.max() / peak - 1),
             "pressure error": float(np.sqrt(self.measure @ (self.pressure - exact) ** 2) / norm),
         }
-        if reference.shear:
-            row["friction force error"] = abs(self.shear / reference.shear - 1)
+        if reference.friction_force:
+            row["friction force error"] = abs(self.friction_force / reference.friction_force - 1)
         return row | {"penetration": self.penetration, "iterations": self.iterations}
 
 
-def by_package(
+def solve_package(
     body: ContactScene, stiffness: float, enforcement: str, tolerance: float = 1e-5
-) -> Found:
+) -> SurfaceSolution:
     """Solve by the penalty or the augmented Lagrangian method of the package."""
     choices = {"enforcement": enforcement, "tolerance": tolerance}
     problem, contact, u, load = problems.problem(body, 2, stiffness, contact_options=choices)
     load.value = body.final_load
     step = problem.solve()
     shear = contact.tangential_traction[:, 0]
-    return Found(
+    return SurfaceSolution(
         displacement=body.displacement(u),
         x=contact.points[:, 0],
         pressure=contact.pressure,
         penetration=step.contacts["contact"].max_penetration,
-        shear=float(contact.measure @ shear),
+        friction_force=float(contact.measure @ shear),
         measure=contact.measure,
         iterations=step.iterations,
     )
@@ -95,11 +95,11 @@ class NewtonFailed(RuntimeError):
     """The hand-written Newton method did not converge."""
 
 
-def by_nitsche(body: ContactScene, factor: float, share: float) -> Found:
+def solve_nitsche(body: ContactScene, factor: float, theta: float) -> SurfaceSolution:
     """Solve by Nitsche's method for frictional contact (Chouly, Hild), γ = ``factor`` E/h.
 
     ∫ σ(u):ε(v) - θ ∫ σ(u)n·σ(v)n/γ + ∫ P(σ(u)n - γ jump)·(θ σ(v)n/γ - v) over Γc, where
-    P projects onto pressures and tractions within the friction cone; θ = ``share``, and θ = 1 is
+    P projects onto pressures and tractions within the friction cone; θ = ``theta``, and θ = 1 is
     symmetric without friction.
     """
     u, F, load, bcs = problems.elasticity_problem(body, 2)
@@ -108,7 +108,7 @@ def by_nitsche(body: ContactScene, factor: float, share: float) -> Found:
     v = ufl.TestFunction(V)
     gamma = factor * body.E / body.h
     elastic = body.elastic(u)
-    theta = fem.Constant(body.mesh, share)
+    weight = fem.Constant(body.mesh, theta)
     surface = fc.ContactSurface(body.mesh, body.tags, body.surface)
     quadrature = surface.quadrature(2)
     n = ufl.as_vector([0.0, -1.0])
@@ -126,7 +126,7 @@ def by_nitsche(body: ContactScene, factor: float, share: float) -> Found:
     if body.friction:
         limit = -body.friction * r_n
         tau = ufl.max_value(-limit, ufl.min_value(s_t - gamma * u[0], limit))
-    F += theta / gamma * ((r_n - s_n) * sv_n + (tau - s_t) * sv_t) * quadrature.ds
+    F += weight / gamma * ((r_n - s_n) * sv_n + (tau - s_t) * sv_t) * quadrature.ds
     F -= (r_n * ufl.dot(v, n) + tau * v[0]) * quadrature.ds
     residual = fem.form(F)
     tangent = fem.form(ufl.derivative(F, u, ufl.TrialFunction(V)))
@@ -134,7 +134,7 @@ def by_nitsche(body: ContactScene, factor: float, share: float) -> Found:
     ksp = PETSc.KSP().create(body.mesh.comm)
     ksp.setOperators(matrix)
     ksp.setType("preonly")
-    symmetric = share == 1.0 and not body.friction
+    symmetric = theta == 1.0 and not body.friction
     ksp.getPC().setType("cholesky" if symmetric else "lu")
     if symmetric:
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -159,24 +159,24 @@ def by_nitsche(body: ContactScene, factor: float, share: float) -> Found:
         iterations += 1
     fields = {"x": ufl.SpatialCoordinate(body.mesh), "p": -r_n, "tau": tau, "down": down}
     points = PointEvaluator(quadrature, fields)()
-    return Found(
+    return SurfaceSolution(
         displacement=body.displacement(u),
         x=points["x"][:, 0],
         pressure=points["p"],
         penetration=float(max(points["down"].max(), 0.0)),
-        shear=float(quadrature.weights @ points["tau"]),
+        friction_force=float(quadrature.weights @ points["tau"]),
         measure=quadrature.weights,
         iterations=iterations,
     )
 
 
-def methods(make: Callable[[], ContactScene]) -> dict[str, Callable[[], Found]]:
+def methods(make: Callable[[], ContactScene]) -> dict[str, Callable[[], SurfaceSolution]]:
     """Return the methods to compare, by name."""
-    found: dict[str, Callable[[], Found]] = {
-        f"penalty {k:g}": lambda k=k: by_package(make(), k, "penalty") for k in PENALTIES
+    found: dict[str, Callable[[], SurfaceSolution]] = {
+        f"penalty {k:g}": lambda k=k: solve_package(make(), k, "penalty") for k in PENALTIES
     }
-    found["augmented 10"] = lambda: by_package(make(), 10.0, "augmented")
-    found |= {name: lambda p=p: by_nitsche(make(), *p) for name, p in NITSCHE.items()}
+    found["augmented 10"] = lambda: solve_package(make(), 10.0, "augmented")
+    found |= {name: lambda p=p: solve_nitsche(make(), *p) for name, p in NITSCHE.items()}
     return found
 
 
@@ -189,10 +189,10 @@ def compare(
     repeat: int,
 ) -> None:
     """Solve one problem by all methods, and write its table."""
-    reference = by_package(make(finer), 10.0, "augmented", tolerance=1e-8)
+    reference = solve_package(make(finer), 10.0, "augmented", tolerance=1e-8)
     coarse: Any = {"GRECO": 8}.get(name.split()[0], 0.5)
 
-    def timed(run: Callable[[], Found]) -> timing.Row:
+    def timed(run: Callable[[], SurfaceSolution]) -> timing.Row:
         try:
             return run().row(reference)
         except (fc.NotConverged, NewtonFailed):
@@ -203,11 +203,11 @@ def compare(
         for s in (size, coarse)
     )
     make(size)
-    rows = timing.measure(runs, repeat=repeat, first=first, once=ONCE)
-    rows = timing.in_units_of(rows, YARDSTICK, "time / penalty 10")
+    rows = timing.measure(runs, repeat=repeat, first=first, once=MAX_REPEATED_TIME)
+    rows = timing.in_units_of(rows, REFERENCE_RUN, "time / penalty 10")
     dofs = problems.n_dofs(problems.elasticity_problem(make(size), 2)[0].function_space)
     note = f"Reference: displacement {reference.displacement:.9g}, peak pressure "
-    note += f"{reference.pressure.max():.7g}, friction force {reference.shear:.7g}."
+    note += f"{reference.pressure.max():.7g}, friction force {reference.friction_force:.7g}."
     stem = name.lower().replace(" ", "_").replace("=", "").replace("μ", "mu").replace(".", "")
     timing.write(folder, stem, f"{name}, {dofs} dofs", rows, note)
 

@@ -37,22 +37,22 @@ from fenics_contact.types import Array
 from scenes import sliding_rubber_block
 from scenes.blocks import BOTTOM, LEFT, TOP, block_mesh
 
-PRESSED, MORE = 12, 8  # increments of indentation, and of rotation and sliding each
-RADIUS, DEPTH, TURN, WAY = 4.0, 3.0, 0.8, 2.0
+N_INDENTATION, N_SLIDING = 12, 8  # increments of indentation, and of rotation and sliding each
+RADIUS, DEPTH, ROTATION, SLIDING_DISTANCE = 4.0, 3.0, 0.8, 2.0
 PATH = (
-    *((0.0, DEPTH * i / PRESSED, 0.0) for i in range(1, PRESSED + 1)),
-    *((0.0, DEPTH, TURN * i / MORE) for i in range(1, MORE + 1)),
-    *((WAY * i / MORE, DEPTH, TURN) for i in range(1, MORE + 1)),
+    *((0.0, DEPTH * i / N_INDENTATION, 0.0) for i in range(1, N_INDENTATION + 1)),
+    *((0.0, DEPTH, ROTATION * i / N_SLIDING) for i in range(1, N_SLIDING + 1)),
+    *((SLIDING_DISTANCE * i / N_SLIDING, DEPTH, ROTATION) for i in range(1, N_SLIDING + 1)),
 )
 
 
-class UnderADisc:
+class BlockUnderDisc:
     """A neo-Hookean rubber block under a rigid disc.
 
     Attributes:
         path: Positions of the disc, one per increment.
         parts: Increments of each part of the path.
-        held: Tags of the facets with prescribed displacements in the runs without contact.
+        prescribed_tags: Tags of the facets with prescribed displacements in runs without contact.
         free: Tag of facets that are never in contact.
         bcs: Dirichlet conditions of the run with contact.
         contact: The contact.
@@ -60,11 +60,11 @@ class UnderADisc:
 
     path = PATH
     parts: Mapping[str, slice] = {
-        "indentation": slice(PRESSED),
-        "rotation": slice(PRESSED, -MORE),
-        "sliding": slice(-MORE, None),
+        "indentation": slice(N_INDENTATION),
+        "rotation": slice(N_INDENTATION, -N_SLIDING),
+        "sliding": slice(-N_SLIDING, None),
     }
-    held = (BOTTOM, TOP)
+    prescribed_tags = (BOTTOM, TOP)
     free = LEFT
 
     def __init__(self, friction: float, fine: int) -> None:
@@ -91,15 +91,15 @@ class UnderADisc:
         self._shift.value[:], self._angle.value = (side, -depth), turn
 
 
-class OneOnAnother(sliding_rubber_block.SlidingRubberBlock):
-    """Two rubber blocks, with the attributes of `UnderADisc`."""
+class BlockOnBlock(sliding_rubber_block.SlidingRubberBlock):
+    """Two rubber blocks, with the attributes of `BlockUnderDisc`."""
 
     path = sliding_rubber_block.PATH
     parts: Mapping[str, slice] = {
         "indentation": slice(sliding_rubber_block.N_PRESSING),
         "sliding": slice(sliding_rubber_block.N_PRESSING, None),
     }
-    held = (
+    prescribed_tags = (
         sliding_rubber_block.BOTTOM,
         sliding_rubber_block.TOP,
         sliding_rubber_block.LOWER,
@@ -108,11 +108,11 @@ class OneOnAnother(sliding_rubber_block.SlidingRubberBlock):
     free = sliding_rubber_block.SIDE
 
 
-Scene = Callable[[float, int], UnderADisc | OneOnAnother]
-SCENES: Mapping[str, Scene] = {"disc": UnderADisc, "two bodies": OneOnAnother}
+Scene = Callable[[float, int], BlockUnderDisc | BlockOnBlock]
+SCENES: Mapping[str, Scene] = {"disc": BlockUnderDisc, "two bodies": BlockOnBlock}
 
 
-def with_contact(made: UnderADisc | OneOnAnother) -> tuple[timing.Row, list[Array]]:
+def solve_contact(made: BlockUnderDisc | BlockOnBlock) -> tuple[timing.Row, list[Array]]:
     """Solve with contact; return the row and the displacements of every increment."""
     problem = fc.ContactProblem(made.residual, made.u, bcs=made.bcs, contacts=[made.contact])
     steps, states, start = [], [], time.process_time()
@@ -121,20 +121,22 @@ def with_contact(made: UnderADisc | OneOnAnother) -> tuple[timing.Row, list[Arra
         steps.append(problem.solve())
         problem.commit()
         states.append(made.u.x.array.copy())
-    return row_of(made, steps, start), states
+    return tabulate_steps(made, steps, start), states
 
 
-def held(made: UnderADisc | OneOnAnother) -> tuple[fem.Function, list[fem.DirichletBC]]:
+def prescribed_conditions(
+    made: BlockUnderDisc | BlockOnBlock,
+) -> tuple[fem.Function, list[fem.DirichletBC]]:
     """Return the function of prescribed values and the conditions of the runs without contact."""
     V = made.u.function_space
     values = fem.Function(V)
-    faces = np.sort(np.concatenate([made.tags.find(tag) for tag in made.held]))
+    faces = np.sort(np.concatenate([made.tags.find(tag) for tag in made.prescribed_tags]))
     return values, [fem.dirichletbc(values, fem.locate_dofs_topological(V, 1, faces))]
 
 
-def prescribed(made: UnderADisc | OneOnAnother, states: Sequence[Array]) -> timing.Row:
+def solve_bulk(made: BlockUnderDisc | BlockOnBlock, states: Sequence[Array]) -> timing.Row:
     """Solve the bulk alone by the package, whose contact plane is never reached; return the row."""
-    values, bcs = held(made)
+    values, bcs = prescribed_conditions(made)
     far = fc.HalfSpace((0.0, 100.0), (0.0, -1.0))
     surface = fc.ContactSurface(made.u.function_space.mesh, made.tags, made.free)
     contact = fc.Contact(made.u, surface, far, fc.Frictionless(1e4), kinematics="finite")
@@ -145,12 +147,12 @@ def prescribed(made: UnderADisc | OneOnAnother, states: Sequence[Array]) -> timi
         steps.append(problem.solve())
         problem.commit()
     check(made.u, states[-1])
-    return row_of(made, steps, start)
+    return tabulate_steps(made, steps, start)
 
 
-def plain(made: UnderADisc | OneOnAnother, states: Sequence[Array]) -> timing.Row:
+def solve_bulk_dolfinx(made: BlockUnderDisc | BlockOnBlock, states: Sequence[Array]) -> timing.Row:
     """Solve the bulk alone by SNES, to the same residual; return the row."""
-    values, bcs = held(made)
+    values, bcs = prescribed_conditions(made)
     compiled = fem.form(made.residual)
     iterations, start = [], time.process_time()
     for state in states:
@@ -162,7 +164,7 @@ def plain(made: UnderADisc | OneOnAnother, states: Sequence[Array]) -> timing.Ro
         row = costs.newton(made.residual, made.u, bcs, forces.norm(), lift=True)
         iterations.append(int(row["iterations"]))
     check(made.u, states[-1])
-    return counted(made, iterations, iterations, start)
+    return tabulate_iterations(made, iterations, iterations, start)
 
 
 def check(u: fem.Function, state: Array) -> None:
@@ -171,14 +173,16 @@ def check(u: fem.Function, state: Array) -> None:
     assert np.abs(u.x.array - state).max(initial=0.0) < 1e-5 * size
 
 
-def row_of(made: UnderADisc | OneOnAnother, steps: Sequence[fc.Step], start: float) -> timing.Row:
+def tabulate_steps(
+    made: BlockUnderDisc | BlockOnBlock, steps: Sequence[fc.Step], start: float
+) -> timing.Row:
     """Return the row of a run by the package."""
     factorisations = [step.factorisations for step in steps]
-    return counted(made, [step.iterations for step in steps], factorisations, start)
+    return tabulate_iterations(made, [step.iterations for step in steps], factorisations, start)
 
 
-def counted(
-    made: UnderADisc | OneOnAnother,
+def tabulate_iterations(
+    made: BlockUnderDisc | BlockOnBlock,
     steps: Sequence[int],
     factorisations: Sequence[int],
     start: float,
@@ -197,15 +201,17 @@ def main() -> None:
     for name, scene in SCENES.items():
         for friction in (0.0, 0.3):
 
-            def make(friction: float = friction, scene: Scene = scene) -> UnderADisc | OneOnAnother:
+            def make(
+                friction: float = friction, scene: Scene = scene
+            ) -> BlockUnderDisc | BlockOnBlock:
                 return scene(friction, fine)
 
-            _, states = with_contact(make())
+            _, states = solve_contact(make())
             runs: dict[str, Callable[[], timing.Row]] = {
-                "contact": lambda make=make: with_contact(make())[0],
-                "bulk only": functools.partial(lambda make, s: prescribed(make(), s), make, states),
+                "contact": lambda make=make: solve_contact(make())[0],
+                "bulk only": functools.partial(lambda make, s: solve_bulk(make(), s), make, states),
                 "bulk only, DOLFINx": functools.partial(
-                    lambda make, s: plain(make(), s), make, states
+                    lambda make, s: solve_bulk_dolfinx(make(), s), make, states
                 ),
             }
             made = timing.measure(runs, repeat=1 if arguments.short else arguments.repeat)

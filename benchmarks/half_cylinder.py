@@ -24,7 +24,7 @@ from scenes import problems
 from scenes.problems import hertz
 
 # Fewest increments that are compared with the independent solution.
-MANY = 40
+MIN_COMPARED_INCREMENTS = 40
 
 
 @cache
@@ -40,7 +40,7 @@ def one_increment(friction: float, h: float) -> dict[str, float]:
 
 def errors(finer: float, friction: float, steps: int, results: costs.Row) -> costs.Row:
     """Return the errors of the displacement of the top and of the peak pressure (%)."""
-    if friction and steps < MANY:
+    if friction and steps < MIN_COMPARED_INCREMENTS:
         exact = one_increment(friction, finer)
     elif friction in hertz.EXACT:
         values = hertz.EXACT[friction]
@@ -65,7 +65,7 @@ def main() -> None:
     )
     parser.add_argument("--degree", type=int, default=2)
     parser.add_argument("--friction", type=float, nargs="*", default=[0.0, 0.2])
-    parser.add_argument("--increments", type=int, nargs="*", default=[1, MANY])
+    parser.add_argument("--increments", type=int, nargs="*", default=[1, MIN_COMPARED_INCREMENTS])
     parser.add_argument("--all", action="store_true", help="40 increments on all dofs, too")
     arguments = parser.parse_args()
     if MPI.COMM_WORLD.size > 1:
@@ -73,7 +73,7 @@ def main() -> None:
     sizes = [0.25, 0.12, 0.06] if arguments.short else arguments.h
     finer = min(sizes) / 1.5
     for friction in arguments.friction:
-        if friction and min(arguments.increments) < MANY:
+        if friction and min(arguments.increments) < MIN_COMPARED_INCREMENTS:
             one_increment(friction, finer)
 
     def make(h: float) -> costs.Case:

@@ -38,12 +38,12 @@ from scenes.processes import run_json
 
 COMM = MPI.COMM_WORLD
 FRICTION = 0.3
-FACTOR = 10.0  # k_n h/E = k_t h/E
-YARDSTICK = "linear, multigrid"
-DEFAULT = (YARDSTICK, "contact")
+RELATIVE_STIFFNESS = 10.0  # k_n h/E = k_t h/E
+REFERENCE_RUN = "linear, multigrid"
+DEFAULT = (REFERENCE_RUN, "contact")
 CELLS = {31_944: 21, 107_811: 32, 331_776: 47, 1_029_000: 69}
 # Most dofs that are factored; more take minutes, or do not fit into memory.
-MANY = 150_000
+MAX_FACTORED_DOFS = 150_000
 # Operations of a solution, and PETSc's events for each.
 EVENTS = {
     "products with matrices": ("MatMult", "MatMultAdd", "MatMultTranspose"),
@@ -61,58 +61,58 @@ def package(**options: Any) -> Run:
     return lambda case: case.package(FRICTION, **options)
 
 
-def yardstick(kind: str) -> Run:
+def linear(kind: str) -> Run:
     """Return a run of one linear solve."""
     return lambda case: case.linear(kind)
 
 
-def by_hand(kind: str) -> Run:
+def plain_dolfinx(kind: str) -> Run:
     """Return a run of the hand-written method in DOLFINx."""
     return lambda case: case.plain(FRICTION, kind)
 
 
 RUNS: dict[str, Run] = {
-    YARDSTICK: yardstick("multigrid"),
-    "linear, direct": yardstick("direct"),
+    REFERENCE_RUN: linear("multigrid"),
+    "linear, direct": linear("direct"),
     "contact": package(),
     "contact, multigrid": package(method="lbfgs", condensation=False, linear_solver="multigrid"),
     "contact, multigrid, Newton": package(method="newton", linear_solver="multigrid"),
     "contact, condensed": package(condensation=True),
-    "by hand, GMRES + GAMG": by_hand("multigrid"),
-    "by hand, LU": by_hand("direct"),
+    "by hand, GMRES + GAMG": plain_dolfinx("multigrid"),
+    "by hand, LU": plain_dolfinx("direct"),
 }
-FACTORED = ("linear, direct", "contact, condensed", "by hand, LU")
+FACTORED_RUNS = ("linear, direct", "contact, condensed", "by hand, LU")
 
 
 # ---- one process per run -------------------------------------------------------------------------
 
 
-def child(run: str, cells: int, repeat: int) -> None:
+def run_in_process(run: str, cells: int, repeat: int) -> None:
     """Time one run and print its row as JSON, the last line of rank 0. Collective."""
     PETSc.Log.begin()
     start = time.perf_counter()
-    RUNS[run](costs.Case(problems.ball_on_block(6), 1, FACTOR))
+    RUNS[run](costs.Case(problems.ball_on_block(6), 1, RELATIVE_STIFFNESS))
     first = time.perf_counter() - start
-    case = costs.Case(problems.ball_on_block(cells), 1, FACTOR)
-    times, before, spent = [], counted(), events()
+    case = costs.Case(problems.ball_on_block(cells), 1, RELATIVE_STIFFNESS)
+    times, before, spent = [], count_operations(), event_times()
     for _ in range(repeat):
         COMM.Barrier()
         start = time.perf_counter()
         row = RUNS[run](case)
         times.append(COMM.allreduce(time.perf_counter() - start, op=MPI.MAX))
-    made, shares = (counted() - before) / repeat, (events() - spent) / repeat
+    made, times_by_event = (count_operations() - before) / repeat, (event_times() - spent) / repeat
     flops, messages, sent, reductions = (COMM.allreduce(float(v), op=MPI.MAX) for v in made)
     row = {"run": run, "dofs": case.n_dofs, "ranks": COMM.size} | row
     row |= {"seconds": statistics.median(times), "GiB": timing.peak_memory()}
     row |= {"Gflop": flops / 1e9, "messages": messages, "MB sent": sent / 1e6}
     row |= {"reductions": reductions, "first run [s]": first}
-    for name, seconds in zip(EVENTS, shares, strict=True):
+    for name, seconds in zip(EVENTS, times_by_event, strict=True):
         row[f"{name} [s]"] = COMM.allreduce(float(seconds), op=MPI.MAX)
     if COMM.rank == 0:
         print(json.dumps(row), flush=True)
 
 
-def counted() -> np.ndarray:
+def count_operations() -> np.ndarray:
     """Return operations, messages, bytes sent and reductions of this rank in solves so far."""
     found = [PETSc.Log.Event(name).getPerfInfo() for name in ("KSPSolve", "SNESSolve")]
     # SNES includes its linear solves.
@@ -120,7 +120,7 @@ def counted() -> np.ndarray:
     return np.array([info[k] for k in ("flops", "numMessages", "messageLength", "numReductions")])
 
 
-def events() -> np.ndarray:
+def event_times() -> np.ndarray:
     """Return the seconds of this rank so far in each of `EVENTS`."""
     return np.array(
         [
@@ -130,7 +130,7 @@ def events() -> np.ndarray:
     )
 
 
-def start(run: str, cells: int, ranks: int, repeat: int) -> dict[str, Any]:
+def start_process(run: str, cells: int, ranks: int, repeat: int) -> dict[str, Any]:
     """Return the row of a run in new processes."""
     words = ["--child", run, "--cells", cells, "--repeat", repeat]
     try:
@@ -139,14 +139,14 @@ def start(run: str, cells: int, ranks: int, repeat: int) -> dict[str, Any]:
         return {"run": run, "ranks": ranks, "iterations": "failed", "seconds": float("nan")}
 
 
-def in_units(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def add_ratios(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Add times in linear solves on as many ranks, and speed-ups, to the rows of one mesh."""
 
     def of(run: str, ranks: int) -> float:
         return next((r["seconds"] for r in rows if (r["run"], r["ranks"]) == (run, ranks)), np.nan)
 
     for row in rows:
-        for name in (YARDSTICK, "linear, direct"):
+        for name in (REFERENCE_RUN, "linear, direct"):
             unit = of(name, row["ranks"])
             if not np.isnan(unit):
                 row[f"linear solves ({name.split()[1]})"] = row["seconds"] / unit
@@ -164,7 +164,7 @@ def main() -> None:
     parser.add_argument("--child", choices=RUNS, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.child:
-        child(arguments.child, arguments.cells[0], arguments.repeat)
+        run_in_process(arguments.child, arguments.cells[0], arguments.repeat)
         return
     default = [12, 16] if arguments.short else list(CELLS.values())
     rows: list[dict[str, Any]] = []
@@ -172,22 +172,22 @@ def main() -> None:
         n_dofs = 3 * (cells + 1) ** 3
         some = []
         for run in arguments.runs:
-            if run in FACTORED and n_dofs > MANY:
+            if run in FACTORED_RUNS and n_dofs > MAX_FACTORED_DOFS:
                 continue
             for ranks in arguments.ranks:
-                repeat = 1 if n_dofs > MANY else arguments.repeat
-                some.append(start(run, cells, ranks, repeat))
+                repeat = 1 if n_dofs > MAX_FACTORED_DOFS else arguments.repeat
+                some.append(start_process(run, cells, ranks, repeat))
                 print(
                     f"{cells} cells, {run}, {ranks} ranks: {some[-1]['seconds']:.3g} s", flush=True
                 )
-        rows += in_units(some)
+        rows += add_ratios(some)
     finest = [row["force"] for row in rows if "force" in row]
     for row in rows:
         if "force" in row:
             # A quarter of the problem is modelled.
             row["force/finest - 1"] = row["force"] / finest[-1] - 1
             row["force/Hertz - 1"] = 4 * row["force"] / problems.hertz_force() - 1
-    title = f"Ball on a block, hexahedra, μ = {FRICTION:g}, k h/E = {FACTOR:g}"
+    title = f"Ball on a block, hexahedra, μ = {FRICTION:g}, k h/E = {RELATIVE_STIFFNESS:g}"
     timing.write(arguments.output, "large", title, rows)
 
 

@@ -33,9 +33,9 @@ from scenes.tags import at_coordinate, at_interface, plane, tag_by_nodes
 
 METHODS = ("lbfgs", "newton", "continuation", "alternating", "primal_dual")
 STIFFNESSES = (10.0, 1000.0)
-FAR_METHODS, FAR_STIFFNESSES = ("lbfgs", "newton", "continuation"), (1.0, 10.0)
+FINITE_METHODS, FINITE_STIFFNESSES = ("lbfgs", "newton", "continuation"), (1.0, 10.0)
 # Runs that take longer are not repeated (s).
-ONCE = 5.0
+MAX_REPEATED_TIME = 5.0
 Loading = tuple[fc.ContactProblem, Callable[[float], None], int]
 
 
@@ -137,8 +137,8 @@ SCENES = {
     "half-cylinder": (half_cylinder, METHODS, STIFFNESSES),
     "dragged cylinder": (dragged_cylinder, METHODS, STIFFNESSES),
     "dragged ball": (dragged_ball, METHODS, STIFFNESSES),
-    "dragged block": (dragged_block, FAR_METHODS, FAR_STIFFNESSES),
-    "dragged block, space": (partial(dragged_block, d=3), FAR_METHODS, FAR_STIFFNESSES),
+    "dragged block": (dragged_block, FINITE_METHODS, FINITE_STIFFNESSES),
+    "dragged block, space": (partial(dragged_block, d=3), FINITE_METHODS, FINITE_STIFFNESSES),
 }
 
 
@@ -149,7 +149,7 @@ def measure(repeats: int) -> Iterator[dict[str, object]]:
             for method in methods:
                 times, outcome, iterations, factorisations = [], "converged", 0, 0
                 for _ in range(repeats):
-                    if max(times, default=0.0) > ONCE:
+                    if max(times, default=0.0) > MAX_REPEATED_TIME:
                         break
                     problem, load, steps = make(method, stiffness)
                     iterations = factorisations = 0

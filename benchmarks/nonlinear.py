@@ -30,7 +30,7 @@ METHODS = ("newton", "lbfgs")
 STIFFNESSES = (10.0, 1000.0)
 STEPS, E = 10, 1000.0
 # Runs that take longer are not repeated (s).
-ONCE = 10.0
+MAX_REPEATED_TIME = 10.0
 Made = tuple[Rubber, float, Callable[[], None]]
 
 
@@ -39,7 +39,7 @@ def hyperelastic(n: int) -> Made:
     return rubber("triangle", n=(2 * n, n), E=E), 0.15, lambda: None
 
 
-def with_pressure(n: int) -> Made:
+def mixed_rubber(n: int) -> Made:
     """Create a block of nearly incompressible rubber, with the pressure as an unknown."""
     scene = rubber("triangle", n=(2 * n, n), E=E, nu=0.4999, mixed="Taylor-Hood")
     return scene, 0.15, lambda: None
@@ -53,22 +53,24 @@ def plastic(n: int) -> Made:
     at_points = basix.ufl.quadrature_element("triangle", value_shape=(3, 3), degree=2)
     number = basix.ufl.quadrature_element("triangle", degree=2)
     strains = fem.Function(fem.functionspace(scene.mesh, at_points), name="plastic strain")
-    way = fem.Function(fem.functionspace(scene.mesh, number), name="accumulated")
+    accumulated_strain = fem.Function(fem.functionspace(scene.mesh, number), name="accumulated")
     epsilon = ufl.sym(ufl.grad(u))
     rows = [[epsilon[0, 0], epsilon[0, 1], 0], [epsilon[0, 1], epsilon[1, 1], 0], [0, 0, 0]]
     strain = ufl.as_tensor(rows)
     trial = 2 * shear * ufl.dev(strain - strains)
     size = ufl.sqrt(1.5 * ufl.inner(trial, trial) + (1e-9 * strength) ** 2)
-    excess = ufl.max_value(size - strength - hardening * way, 0) / (3 * shear + hardening)
+    excess = ufl.max_value(size - strength - hardening * accumulated_strain, 0) / (
+        3 * shear + hardening
+    )
     flow = 1.5 * excess * trial / size
     stress = trial - 2 * shear * flow + bulk * ufl.tr(strain) * ufl.Identity(3)
     virtual = ufl.derivative(strain, u, ufl.TestFunction(space))
     scene.F = ufl.inner(stress, virtual) * ufl.dx(scene.mesh, degree=2)
     points, _ = basix.make_quadrature(basix.CellType.triangle, 2)
     grown = {strains: fem.Expression(strains + flow, points)}
-    grown[way] = fem.Expression(way + excess, points)
+    grown[accumulated_strain] = fem.Expression(accumulated_strain + excess, points)
 
-    def keep() -> None:
+    def update_strains() -> None:
         values = []
         for function, expression in grown.items():
             found = fem.Function(function.function_space)
@@ -77,15 +79,15 @@ def plastic(n: int) -> Made:
         for function, array in zip(grown, values, strict=True):
             function.x.array[:] = array
 
-    return scene, 0.02, keep
+    return scene, 0.02, update_strains
 
 
-SCENES = {"neo-Hookean": hyperelastic, "with pressure": with_pressure, "J2": plastic}
+SCENES = {"neo-Hookean": hyperelastic, "with pressure": mixed_rubber, "J2": plastic}
 
 
 def run(make: Callable[[int], Made], stiffness: float, method: str, n: int) -> timing.Row:
     """Solve one load history, and return its row."""
-    scene, depth, keep = make(n)
+    scene, depth, update_strains = make(n)
     shift = fem.Constant(scene.mesh, np.zeros(2))
     k = fc.RelativeStiffness(stiffness)
     kinematics = "small" if depth < 0.1 else "finite"
@@ -105,7 +107,7 @@ def run(make: Callable[[int], Made], stiffness: float, method: str, n: int) -> t
     try:
         for step in fc.increments(problem, load, steps=STEPS, max_cuts=0):
             iterations.append(step.iterations)
-            keep()
+            update_strains()
     except fc.NotConverged as error:
         iterations.append(error.iterations)
         outcome = f"failed at increment {error.increment}"
@@ -122,11 +124,11 @@ def main() -> None:
             runs = {m: functools.partial(run, make, stiffness, m, n) for m in METHODS}
             first = {m: functools.partial(run, make, stiffness, m, 4) for m in METHODS}
             repeat = 1 if arguments.short else arguments.repeat
-            for row in timing.measure(runs, repeat=repeat, first=first, once=ONCE):
-                told = {"scene": scene, "k_n h/E": stiffness, "method": row["run"]}
-                told |= {k: row[k] for k in ("outcome", "iterations", "most", "seconds")}
-                rows.append(told)
-                print(*told.values(), sep="  ", flush=True)
+            for row in timing.measure(runs, repeat=repeat, first=first, once=MAX_REPEATED_TIME):
+                summary = {"scene": scene, "k_n h/E": stiffness, "method": row["run"]}
+                summary |= {k: row[k] for k in ("outcome", "iterations", "most", "seconds")}
+                rows.append(summary)
+                print(*summary.values(), sep="  ", flush=True)
     timing.write(arguments.output, "nonlinear", "L-BFGS and Newton with nonlinear bulks", rows)
 
 

@@ -21,7 +21,7 @@ SIZES = {
         "one linear solve",
         "μ = 0.2, 1 increments: by default",
         "μ = 0.2, 40 increments: by default",
-        f"μ = 0.2, 40 increments: by default{costs.AT_END}",
+        f"μ = 0.2, 40 increments: by default{costs.LAST_INTERIOR}",
         "μ = 0.2: plain DOLFINx, LU",
     ),
     "ball": (

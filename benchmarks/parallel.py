@@ -72,7 +72,7 @@ NETWORKS = {
 # elimination of an interface (s) that is listed.
 SIZES = (1e5, 1e6, 1e7, 1e8, 1e9)
 RANKS = (1, 4, 16, 64, 256, 1024)
-NODE, FEWEST, BEARABLE = 16.0, 5000, 600.0
+MEMORY_PER_RANK, MIN_DOFS_PER_RANK, MAX_ELIMINATION_TIME = 16.0, 5000, 600.0
 
 
 # ---- the machine ---------------------------------------------------------------------------------
@@ -140,7 +140,7 @@ def _copy(a: np.ndarray, b: np.ndarray) -> float:
 # ---- the model -----------------------------------------------------------------------------------
 
 
-def predicted(c: float, row: Row, machine: Machine) -> float:
+def predict_time(c: float, row: Row, machine: Machine) -> float:
     """Return the time of the model for the dofs, iterations and counts of a row.
 
     Args:
@@ -162,7 +162,7 @@ def fit_operations(rows: Sequence[Row]) -> float:
     return float(np.exp(np.mean(np.log(each))))
 
 
-def on_many(rows: Sequence[Row], dofs: float, ranks: int) -> Row:
+def extrapolate_counts(rows: Sequence[Row], dofs: float, ranks: int) -> Row:
     """Extrapolate the counts of an iteration from two ranks to many.
 
     On two ranks the body is cut once, through about n^(2/3) dofs; on many every subdomain has
@@ -187,13 +187,13 @@ def on_many(rows: Sequence[Row], dofs: float, ranks: int) -> Row:
 
 def speed_up(c: float, rows: Sequence[Row], dofs: float, ranks: int, machine: Machine) -> float:
     """Return the speed-up of the model."""
-    return c * dofs / predicted(c, on_many(rows, dofs, ranks), machine)
+    return c * dofs / predict_time(c, extrapolate_counts(rows, dofs, ranks), machine)
 
 
 # ---- tables --------------------------------------------------------------------------------------
 
 
-def compared(rows: Sequence[Row], machine: Machine) -> list[Row]:
+def compare_ranks(rows: Sequence[Row], machine: Machine) -> list[Row]:
     """Return the table of measured times and the model, on one and two ranks."""
     found = []
     for run in dict.fromkeys(row["run"] for row in rows):
@@ -202,12 +202,12 @@ def compared(rows: Sequence[Row], machine: Machine) -> list[Row]:
         for row in mine:
             new: Row = {name: row[name] for name in ("run", "dofs", "ranks", "iterations")}
             new["seconds"] = row["seconds"]
-            new["model [s]"] = predicted(c, row, machine)
+            new["model [s]"] = predict_time(c, row, machine)
             if row["ranks"] > 1:
                 one = next(r for r in mine if (r["dofs"], r["ranks"]) == (row["dofs"], 1))
                 new["speed-up"] = one["seconds"] / row["seconds"]
-                new["speed-up, model"] = predicted(c, one, machine) / new["model [s]"]
-                new["messages and reductions [s]"] = predicted(0.0, row, machine)
+                new["speed-up, model"] = predict_time(c, one, machine) / new["model [s]"]
+                new["messages and reductions [s]"] = predict_time(0.0, row, machine)
             new["GiB per rank"] = row["GiB"] / row["ranks"]
             new["kB per dof"] = row["GiB"] * 2**20 / row["dofs"]
             found.append(new)
@@ -248,7 +248,7 @@ def counts(rows: Sequence[Row]) -> list[Row]:
     ]
 
 
-def beyond(c: float, rows: Sequence[Row], here: Machine) -> list[Row]:
+def extrapolate_speed_up(c: float, rows: Sequence[Row], here: Machine) -> list[Row]:
     """Return the table of speed-ups of the model on many ranks."""
     found = []
     for name, machine in NETWORKS.items():
@@ -260,7 +260,7 @@ def beyond(c: float, rows: Sequence[Row], here: Machine) -> list[Row]:
     return found
 
 
-def by_multigrid(rows: Sequence[Row], c: float, machine: Machine) -> list[Row]:
+def extrapolate_time(rows: Sequence[Row], c: float, machine: Machine) -> list[Row]:
     """Return the table of times of one increment with contact on many ranks, by the model.
 
     Args:
@@ -277,14 +277,14 @@ def by_multigrid(rows: Sequence[Row], c: float, machine: Machine) -> list[Row]:
         row: Row = {"dofs": f"{dofs:.0e}"}
         for ranks in RANKS:
             one = {"dofs": dofs, "ranks": 1, "iterations": 1}
-            each = on_many(rows, dofs, ranks) if ranks > 1 else one
+            each = extrapolate_counts(rows, dofs, ranks) if ranks > 1 else one
             name = f"{ranks} ranks [s]" if ranks > 1 else "1 rank [s]"
-            if memory * dofs / ranks > NODE:
+            if memory * dofs / ranks > MEMORY_PER_RANK:
                 row[name] = "memory"
-            elif dofs / ranks < FEWEST:
+            elif dofs / ranks < MIN_DOFS_PER_RANK:
                 row[name] = "too few"
             else:
-                row[name] = iterations * predicted(c, each, machine)
+                row[name] = iterations * predict_time(c, each, machine)
         found.append(row)
     return found
 
@@ -300,7 +300,7 @@ def interfaces() -> list[Row]:
                 row: Row = {"body": body, "dofs": f"{dofs:.0e}", "ranks": ranks}
                 row |= {"interface dofs": shared, "dense matrix [GiB]": 8 * shared**2 / 2**30}
                 found.append(row | {"seconds at 20 Gflop/s": 2 / 3 * shared**3 / 20e9})
-    return [row for row in found if row["seconds at 20 Gflop/s"] < BEARABLE]
+    return [row for row in found if row["seconds at 20 Gflop/s"] < MAX_ELIMINATION_TIME]
 
 
 def draw(path: Path, rows: Sequence[Row], machine: Machine) -> None:
@@ -323,7 +323,7 @@ def draw(path: Path, rows: Sequence[Row], machine: Machine) -> None:
         axes.legend(fontsize=8)
 
 
-def measured(path: Path) -> list[Row]:
+def read_measurements(path: Path) -> list[Row]:
     """Read stored rows, and convert numbers."""
 
     def value(text: str) -> float | int | str:
@@ -354,7 +354,9 @@ def write_tables(folder: Path, rows: list[Row], machine: Machine) -> None:
         f"operations are {2 / machine.bus:.2f} times as fast on two ranks. c, the time per dof and "
         f"iteration on one rank: {operations_take}."
     )
-    timing.write(folder, "parallel_1", "Two ranks compared with one", compared(rows, machine), note)
+    timing.write(
+        folder, "parallel_1", "Two ranks compared with one", compare_ranks(rows, machine), note
+    )
     timing.write(
         folder, "parallel_2", "Time by operation", operations(rows),
         "Seconds of the slowest rank in PETSc's operations, which overlap: products and smoothing "
@@ -371,21 +373,24 @@ def write_tables(folder: Path, rows: list[Row], machine: Machine) -> None:
     )
     assumed = f"Assumed, {assumed}, one rank per memory bus, {NEIGHBOURS} neighbours. "
     assumed += "Idle ranks on coarse levels, and load imbalance, are not included."
-    timing.write(folder, "parallel_4", title, beyond(c[RUNS[1]], mine, machine), assumed)
+    timing.write(
+        folder, "parallel_4", title, extrapolate_speed_up(c[RUNS[1]], mine, machine), assumed
+    )
     iterations = max(row["iterations"] for row in mine)
     title = "One increment with contact by L-BFGS and multigrid (model)"
     assumed = (
         f"The model on the fast network, with c as measured here and {iterations} iterations, the "
         "largest number measured, for all sizes: measured were up to 332,000 dofs. "
-        f'"memory": more than {NODE:g} GiB per rank; "too few": fewer than {FEWEST} dofs per '
+        f'"memory": more than {MEMORY_PER_RANK:g} GiB per rank; "too few": fewer than '
+        f"{MIN_DOFS_PER_RANK} dofs per "
         "rank. Coarse levels on one rank, and load imbalance, are not included."
     )
-    on_paper = by_multigrid(mine, c[RUNS[1]], NETWORKS["fast network"])
-    timing.write(folder, "parallel_5", title, on_paper, assumed)
+    extrapolated = extrapolate_time(mine, c[RUNS[1]], NETWORKS["fast network"])
+    timing.write(folder, "parallel_5", title, extrapolated, assumed)
     assumed = (
         "A square or cube cut into one subdomain per rank: interface dofs, their dense matrix on "
         "rank 0, and the 2/3 n³ operations of its elimination. Omitted are those of more than "
-        f"{BEARABLE:g} s."
+        f"{MAX_ELIMINATION_TIME:g} s."
     )
     title = "The interface of the ranks with static condensation (model)"
     timing.write(folder, "parallel_6", title, interfaces(), assumed)
@@ -403,7 +408,9 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.tables:
         machine = Machine(**json.loads((arguments.output / "machine.json").read_text()))
-        write_tables(arguments.output, measured(arguments.output / "parallel.csv"), machine)
+        write_tables(
+            arguments.output, read_measurements(arguments.output / "parallel.csv"), machine
+        )
         return
     if arguments.machine:
         machine = measure_machine()
@@ -412,15 +419,15 @@ def main() -> None:
         return
     rows: list[Row] = []
     for cells in (8, 10) if arguments.short else arguments.cells:
-        repeat = 1 if 3 * (cells + 1) ** 3 > large.MANY else arguments.repeat
+        repeat = 1 if 3 * (cells + 1) ** 3 > large.MAX_FACTORED_DOFS else arguments.repeat
         some = []
         for run in RUNS:
             for ranks in (1, 2):
-                some.append(large.start(run, cells, ranks, repeat))
+                some.append(large.start_process(run, cells, ranks, repeat))
                 print(
                     f"{cells} cells, {run}, {ranks} ranks: {some[-1]['seconds']:.3g} s", flush=True
                 )
-        rows += large.in_units(some)
+        rows += large.add_ratios(some)
     arguments.output.mkdir(parents=True, exist_ok=True)
     report.save(arguments.output / "parallel.csv", rows)
     failed = [row for row in rows if row["iterations"] in ("none", "failed")]

@@ -30,7 +30,7 @@ from verification import finite_scenes, fuzz_scenes, fuzz_setup, sliding_scenes
 
 Scene = dict[str, Any]
 # Not drawn: settings of the solution, and features that some methods do not support.
-LEFT_OUT = (
+EXCLUDED_FEATURES = (
     "far",
     "multipliers",
     "motion",
@@ -40,7 +40,7 @@ LEFT_OUT = (
     "restart",
     "units",
 )
-SAID = ("method", "max_iterations", "restart", "condensation")
+SOLVER_OPTIONS = ("method", "max_iterations", "restart", "condensation")
 # Scenes of a family use the same compiled forms.
 FAMILY = 8
 
@@ -68,7 +68,7 @@ class Kind:
 
 def draw_small(seed: int, family: int) -> Scene:
     """Draw a scene with small displacements."""
-    return fuzz_scenes.draw(seed, without=(*LEFT_OUT, "increment"), family=family)
+    return fuzz_scenes.draw(seed, without=(*EXCLUDED_FEATURES, "increment"), family=family)
 
 
 def draw_fine(seed: int, family: int, stiffer: float = 1.0) -> Scene:
@@ -111,11 +111,11 @@ KINDS = {
 }
 
 
-def outcomes(name: str, kind: Kind, scenes: int) -> Iterator[timing.Row]:
+def solve_scenes(name: str, kind: Kind, scenes: int) -> Iterator[timing.Row]:
     """Yield the row of every scene by the default and by every method alone. Collective."""
     for seed in range(kind.first, kind.first + scenes):
         drawn = kind.draw(seed, seed // FAMILY) | {"cuts": kind.cuts}
-        scene = {key: value for key, value in drawn.items() if key not in SAID}
+        scene = {key: value for key, value in drawn.items() if key not in SOLVER_OPTIONS}
         for method in ("default", *kind.methods):
             alone = {} if method == "default" else {"method": method, "fallback": False}
             iterations: list[int] = []
@@ -141,7 +141,7 @@ def outcomes(name: str, kind: Kind, scenes: int) -> Iterator[timing.Row]:
             }
 
 
-def summary(rows: list[timing.Row]) -> list[timing.Row]:
+def summarise(rows: list[timing.Row]) -> list[timing.Row]:
     """Return the table of complete scenes and iterations by kind and method."""
     table = []
     for kind, method in dict.fromkeys((row["kind"], row["method"]) for row in rows):
@@ -183,9 +183,9 @@ def main() -> None:
         if arguments.only in (None, name):
             scenes = arguments.scenes or (FAMILY if arguments.short else kind.scenes)
             shifted = Kind(**{**vars(kind), "first": kind.first + arguments.start})
-            rows += outcomes(name, shifted, scenes)
+            rows += solve_scenes(name, shifted, scenes)
     timing.write(arguments.output, "scenes", "Random scenes", rows)
-    timing.write(arguments.output, "methods", "The default and its methods alone", summary(rows))
+    timing.write(arguments.output, "methods", "The default and its methods alone", summarise(rows))
 
 
 if __name__ == "__main__":

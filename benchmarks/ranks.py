@@ -36,35 +36,37 @@ Row = timing.Row
 
 def runs(case: costs.Case) -> dict[str, Callable[[], Row]]:
     """Return the runs to time, by name."""
-    found: dict[str, Callable[[], Row]] = {costs.YARDSTICK: case.linear}
+    found: dict[str, Callable[[], Row]] = {costs.REFERENCE_RUN: case.linear}
     for friction in dict.fromkeys(friction for friction, _ in HISTORIES):
         name = f"μ = {friction:g}: {costs.PLAIN['direct']}"
         found[name] = partial(case.plain, friction)
     for friction, steps in HISTORIES:
         name, field = f"μ = {friction:g}, {steps} increments", "every"
         if steps > 1:
-            name, field = name + costs.AT_END, "last"
+            name, field = name + costs.LAST_INTERIOR, "last"
         found[name] = partial(case.package, friction, steps, field)
     return found
 
 
-def child(h: float, repeat: int) -> None:
+def run_in_process(h: float, repeat: int) -> None:
     """Time all runs and print their rows as JSON, the last line of rank 0. Collective."""
     small, case = (
         costs.Case(problems.half_cylinder(0.0, size), DEGREE, STIFFNESS) for size in (0.25, h)
     )
-    rows = timing.measure(runs(case), repeat=repeat, first=runs(small), once=costs.ONCE)
+    rows = timing.measure(
+        runs(case), repeat=repeat, first=runs(small), once=costs.MAX_REPEATED_TIME
+    )
     rows = [{"dofs": case.n_dofs, "ranks": MPI.COMM_WORLD.size} | row for row in rows]
     if MPI.COMM_WORLD.rank == 0:
         print(json.dumps(rows), flush=True)
 
 
-def start(h: float, ranks: int, repeat: int) -> list[Row]:
+def start_process(h: float, ranks: int, repeat: int) -> list[Row]:
     """Return the rows of a mesh size, measured in new processes."""
     return run_json(ranks, Path(__file__).resolve(), "--child", "--h", h, "--repeat", repeat)
 
 
-def compared(rows: list[Row]) -> list[Row]:
+def add_ratios(rows: list[Row]) -> list[Row]:
     """Return the rows of one size with times in linear solves and speed-ups."""
 
     def seconds(run: str, ranks: int) -> float:
@@ -73,9 +75,9 @@ def compared(rows: list[Row]) -> list[Row]:
     found = []
     for row in rows:
         new = {name: row[name] for name in ("dofs", "run", "ranks", "iterations", "seconds")}
-        new["linear solves on one rank"] = row["seconds"] / seconds(costs.YARDSTICK, 1)
+        new["linear solves on one rank"] = row["seconds"] / seconds(costs.REFERENCE_RUN, 1)
         new["linear solves on as many ranks"] = row["seconds"] / seconds(
-            costs.YARDSTICK, row["ranks"]
+            costs.REFERENCE_RUN, row["ranks"]
         )
         new["speed-up"] = seconds(row["run"], 1) / row["seconds"]
         # The results do not depend on the number of ranks.
@@ -92,15 +94,15 @@ def main() -> None:
     parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.child:
-        child(arguments.h[0], arguments.repeat)
+        run_in_process(arguments.h[0], arguments.repeat)
         return
     everything: list[Row] = []
     for h in [0.25, 0.12] if arguments.short else arguments.h:
         rows: list[Row] = []
         for ranks in arguments.ranks:
-            rows += start(h, ranks, arguments.repeat)
+            rows += start_process(h, ranks, arguments.repeat)
             print(f"h = {h:g}, {ranks} ranks: done", flush=True)
-        everything += compared(rows)
+        everything += add_ratios(rows)
     if any(row["iterations"] == "none" for row in everything):
         sys.exit(f"failed: {everything}")
     title = f"Half-cylinder on several ranks, degree {DEGREE}, k h/E = {STIFFNESS:g}"

@@ -48,7 +48,7 @@ BASE, TOP, SIDE = 1, 2, 3
 E, NU, RADIUS, DEPTH = 1000.0, 0.3, 4.0, 0.01
 HALF_WIDTH = (RADIUS * DEPTH) ** 0.5  # of the contact, approximately
 DEFAULT = "default"
-WAYS: dict[str, dict[str, Any]] = {
+CONFIGURATIONS: dict[str, dict[str, Any]] = {
     DEFAULT: {},
     "condensed": {"condensation": True},
     "direct, Newton": {"condensation": False, "linear_solver": "direct", "method": "newton"},
@@ -56,10 +56,10 @@ WAYS: dict[str, dict[str, Any]] = {
     "multigrid, Newton": {"condensation": False, "linear_solver": "multigrid", "method": "newton"},
     "multigrid, L-BFGS": {"condensation": False, "linear_solver": "multigrid", "method": "lbfgs"},
 }
-# Time limit of the other configurations: PATIENCE times the default's time, or LEAST if that is
-# larger, plus LEAST (s).
-PATIENCE, LEAST = 4.0, 30.0
-SLOWEST = 1500.0  # time limit of the default (s)
+# Time limit of the other configurations: TIME_LIMIT_RATIO times the default's time, or
+# MIN_TIME_LIMIT if that is larger, plus MIN_TIME_LIMIT (s).
+TIME_LIMIT_RATIO, MIN_TIME_LIMIT = 4.0, 30.0
+DEFAULT_TIME_LIMIT = 1500.0  # time limit of the default (s)
 
 
 @dataclass(frozen=True)
@@ -173,17 +173,17 @@ def _by_gmsh(low: np.ndarray, size: np.ndarray, h: float) -> dolfinx.mesh.Mesh:
 
 
 @dataclass(frozen=True)
-class Made:
-    """Mesh, displacement, Dirichlet conditions and loads of a scene, created by `make`."""
+class MeshedScene:
+    """Mesh, displacement, Dirichlet conditions and loads of a scene, created by `mesh_scene`."""
 
     u: fem.Function
     joined: fc.JoinedMesh
     bcs: list[fem.DirichletBC]
-    down: fem.Constant
-    along: fem.Constant
+    indentation: fem.Constant
+    sliding: fem.Constant
 
 
-def make(scene: Scene, dofs: float) -> Made:
+def mesh_scene(scene: Scene, dofs: float) -> MeshedScene:
     """Create meshes and conditions of a scene, which is not timed. Collective."""
     joined = fc.join_meshes([block(scene, n, dofs / scene.bodies) for n in range(scene.bodies)])
     u = fem.Function(displacement_space(joined.mesh, scene.degree))
@@ -191,18 +191,18 @@ def make(scene: Scene, dofs: float) -> Made:
     bcs = [dirichlet_bc(u, joined.facets, joined.facet(last, BASE), i) for i in range(d)]
     for body in range(last):  # friction need not constrain them
         bcs += [dirichlet_bc(u, joined.facets, joined.facet(body, SIDE), i) for i in range(d - 1)]
-    down, along = (fem.Constant(joined.mesh, 0.0) for _ in range(2))
-    return Made(u, joined, bcs, down, along)
+    indentation, sliding = (fem.Constant(joined.mesh, 0.0) for _ in range(2))
+    return MeshedScene(u, joined, bcs, indentation, sliding)
 
 
-def solve(scene: Scene, made: Made, options: dict[str, Any]) -> tuple[float, int]:
+def solve(scene: Scene, made: MeshedScene, options: dict[str, Any]) -> tuple[float, int]:
     """Solve all increments; return normal force on the ball and iterations. Collective."""
     u, joined, mesh = made.u, made.joined, made.joined.mesh
     d = len(u)
     v = ufl.TestFunction(u.function_space)
     kind = "plane strain" if d == 2 else "3D"
     body = LinearElastic(u, E, NU, kind) if scene.linear else NeoHookean(u, E, NU, kind)
-    moved = ufl.as_vector([made.along, *[0.0] * (d - 2), made.down])
+    moved = ufl.as_vector([made.sliding, *[0.0] * (d - 2), made.indentation])
     ball = fc.Ball((0.0,) * (d - 1) + (RADIUS,), RADIUS, displacement=moved)
     law = fc.Coulomb(scene.friction) if scene.friction else fc.Frictionless()
     contacts = [
@@ -219,8 +219,8 @@ def solve(scene: Scene, made: Made, options: dict[str, Any]) -> tuple[float, int
     )
 
     def load(t: float) -> None:
-        made.down.value = -DEPTH * min(1.0, 2.0 * t)
-        made.along.value = 0.2 * DEPTH * max(0.0, 2.0 * t - 1.0)
+        made.indentation.value = -DEPTH * min(1.0, 2.0 * t)
+        made.sliding.value = 0.2 * DEPTH * max(0.0, 2.0 * t - 1.0)
 
     steps = fc.increments(problem, load, steps=scene.steps)
     iterations = sum(step.iterations for step in steps)
@@ -230,63 +230,69 @@ def solve(scene: Scene, made: Made, options: dict[str, Any]) -> tuple[float, int
 # ---- one configuration in a new process ----------------------------------------------------------
 
 
-def child(scene: Scene, way: str) -> None:
+def run_in_process(scene: Scene, configuration: str) -> None:
     """Solve with one configuration, and print its row as JSON on rank 0."""
     logging.disable(logging.WARNING)
     warnings.simplefilter("ignore")
     row: dict[str, Any] = {"outcome": "solved"}
-    start, before = time.perf_counter(), _memory("VmRSS")
+    start, before = time.perf_counter(), _process_memory("VmRSS")
     try:
-        solve(scene, make(replace(scene, generous=True), 300.0), WAYS[way])  # compiles the forms
-        made = make(scene, float(scene.dofs))
+        solve(
+            scene, mesh_scene(replace(scene, generous=True), 300.0), CONFIGURATIONS[configuration]
+        )  # compiles the forms
+        made = mesh_scene(scene, float(scene.dofs))
         row["dofs"] = n_dofs(made.u.function_space)
         COMM.Barrier()
-        start, before = time.perf_counter(), _memory("VmRSS")
-        row["force"], row["iterations"] = solve(scene, made, WAYS[way])
+        start, before = time.perf_counter(), _process_memory("VmRSS")
+        row["force"], row["iterations"] = solve(scene, made, CONFIGURATIONS[configuration])
     except fc.NotConverged:
         row["outcome"] = "refused"
     except ValueError as error:
         row["outcome"], row["why"] = "not taken", str(error)[:80]
     row["seconds"] = COMM.allreduce(time.perf_counter() - start, op=MPI.MAX)
-    row["GiB"] = COMM.allreduce(_memory("VmHWM") - before)
+    row["GiB"] = COMM.allreduce(_process_memory("VmHWM") - before)
     if COMM.rank == 0:
         print(json.dumps(row))
 
 
-def _memory(name: str) -> float:
+def _process_memory(name: str) -> float:
     """Return the present (VmRSS) or the peak memory (VmHWM) of this process (GiB)."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return int(next(line for line in lines if line.startswith(name)).split()[1]) / 2**20
 
 
-def run(scene: Scene, seed: int, way: str, limit: float) -> timing.Row:
+def run(scene: Scene, seed: int, configuration: str, limit: float) -> timing.Row:
     """Run a configuration in a new process, which is terminated after ``limit`` (s)."""
-    words = ["-m", "benchmarks.selection", "--child", way, json.dumps(asdict(scene))]
+    words = ["-m", "benchmarks.selection", "--child", configuration, json.dumps(asdict(scene))]
     try:
         row = run_json(scene.ranks, *words, seconds=limit)
     except subprocess.TimeoutExpired:
         row = {"outcome": "slow", "seconds": limit}
     except subprocess.CalledProcessError:
         row = {"outcome": "failed"}
-    return {"seed": seed, "way": way} | row
+    return {"seed": seed, "way": configuration} | row
 
 
 # ---- evaluation ----------------------------------------------------------------------------------
 
 
-def regret(rows: list[timing.Row]) -> list[timing.Row]:
+def compare_with_fastest(rows: list[timing.Row]) -> list[timing.Row]:
     """Compare the default with the fastest other configuration of every scene."""
     table = []
     for seed in dict.fromkeys(row["seed"] for row in rows):
         mine = {row["way"]: row for row in rows if row["seed"] == seed}
-        solved = {way: row for way, row in mine.items() if row["outcome"] == "solved"}
+        solved = {
+            configuration: row for configuration, row in mine.items() if row["outcome"] == "solved"
+        }
         default = solved.get(DEFAULT)
         if default is None or len(solved) < 2:
             outcome = mine[DEFAULT]["outcome"]
             table.append({"seed": seed, "default": outcome, "solved by": ", ".join(solved)})
             continue
-        others = {way: row for way, row in solved.items() if way != DEFAULT}
-        best = min(others, key=lambda way: float(others[way]["seconds"]))
+        others = {
+            configuration: row for configuration, row in solved.items() if configuration != DEFAULT
+        }
+        best = min(others, key=lambda configuration: float(others[configuration]["seconds"]))
         quick = [r for r in solved.values() if r["seconds"] <= 1.25 * others[best]["seconds"]]
         least = min(float(row["GiB"]) for row in quick)
         table.append(
@@ -313,25 +319,33 @@ def main() -> None:
     parser.add_argument("--child", nargs=2, help="for the processes inside")
     arguments = parser.parse_args()
     if arguments.child:
-        way, drawn = arguments.child
-        return child(Scene(**json.loads(drawn)), way)
+        configuration, drawn = arguments.child
+        return run_in_process(Scene(**json.loads(drawn)), configuration)
     scenes, most = (4, 3e3) if arguments.short else (arguments.scenes, arguments.most)
     rows: list[timing.Row] = []
     for seed in range(arguments.start, arguments.start + scenes):
         scene = draw(seed, most=most)
         print(seed, scene, flush=True)
-        limit = SLOWEST
-        for way in WAYS:
-            row = run(scene, seed, way, limit)
+        limit = DEFAULT_TIME_LIMIT
+        for configuration in CONFIGURATIONS:
+            row = run(scene, seed, configuration, limit)
             print(
-                "   ", way, {k: v for k, v in row.items() if k not in ("seed", "way")}, flush=True
+                "   ",
+                configuration,
+                {k: v for k, v in row.items() if k not in ("seed", "way")},
+                flush=True,
             )
             rows.append(row | asdict(scene) | {"dofs": row.get("dofs", scene.dofs)})
-            if way == DEFAULT:
-                limit = max(LEAST, PATIENCE * row.get("seconds", SLOWEST)) + LEAST
+            if configuration == DEFAULT:
+                limit = (
+                    max(MIN_TIME_LIMIT, TIME_LIMIT_RATIO * row.get("seconds", DEFAULT_TIME_LIMIT))
+                    + MIN_TIME_LIMIT
+                )
         arguments.output.mkdir(parents=True, exist_ok=True)
         report.save(arguments.output / "selection.csv", rows)  # after every scene
-    timing.write(arguments.output, "regret", "The default against the best way", regret(rows))
+    timing.write(
+        arguments.output, "regret", "The default against the best way", compare_with_fastest(rows)
+    )
 
 
 if __name__ == "__main__":

@@ -26,11 +26,11 @@ def runs(case: costs.Case, friction: float) -> dict[str, Callable[[], costs.Row]
     """Return the runs to time, by name."""
     package = partial(case.package, friction)
     return {
-        costs.YARDSTICK: case.linear,
-        f"{costs.YARDSTICK}, multigrid": partial(case.linear, "multigrid"),
+        costs.REFERENCE_RUN: case.linear,
+        f"{costs.REFERENCE_RUN}, multigrid": partial(case.linear, "multigrid"),
         "1 increment": package,
         "10 increments": partial(package, 10),
-        f"10 increments{costs.AT_END}": partial(package, 10, "last"),
+        f"10 increments{costs.LAST_INTERIOR}": partial(package, 10, "last"),
         costs.PLAIN["multigrid"]: partial(case.plain, friction, "multigrid"),
     }
 

@@ -34,7 +34,7 @@ TASKS = {
 }
 
 
-def script(place: str, folder: Path) -> Path:
+def copy_script(place: str, folder: Path) -> Path:
     """Copy the script of a task, or the code block of the README, into a folder."""
     source, made = ROOT / place, folder / "script.py"
     if source.suffix == ".md":
@@ -45,7 +45,7 @@ def script(place: str, folder: Path) -> Path:
     return made
 
 
-def used() -> float:
+def processor_time() -> float:
     """Return the CPU time of terminated child processes so far (s)."""
     spent = resource.getrusage(resource.RUSAGE_CHILDREN)
     return spent.ru_utime + spent.ru_stime
@@ -60,15 +60,15 @@ def run(place: str, repeat: int) -> timing.Row:
     seconds = []
     with tempfile.TemporaryDirectory() as name, tempfile.TemporaryDirectory() as cache:
         folder = Path(name)
-        command = [sys.executable, str(script(place, folder))]
+        command = [sys.executable, str(copy_script(place, folder))]
         path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
         changed = {"XDG_CACHE_HOME": cache, "MPLCONFIGDIR": cache, "PYTHONPATH": path}
         for _ in range(1 + repeat):
-            start = used()
+            start = processor_time()
             done = subprocess.run(
                 command, cwd=folder, env=os.environ | changed, capture_output=True, text=True
             )
-            seconds.append(used() - start)
+            seconds.append(processor_time() - start)
             if done.returncode:
                 raise RuntimeError(f"{place} ended with {done.returncode}: {done.stderr[-2000:]}")
         figures = len(list(folder.rglob("*.png")))

@@ -79,9 +79,9 @@ def _timed(run: Callable[[], Row]) -> tuple[float, Row]:
     return MPI.COMM_WORLD.allreduce(time.perf_counter() - start, op=MPI.MAX), row
 
 
-def in_units_of(rows: list[Row], yardstick: str, column: str) -> list[Row]:
-    """Add a column to the rows: seconds relative to those of the run ``yardstick``."""
-    unit = next(row["seconds"] for row in rows if row["run"] == yardstick)
+def in_units_of(rows: list[Row], reference_run: str, column: str) -> list[Row]:
+    """Add a column to the rows: seconds relative to those of the run ``reference_run``."""
+    unit = next(row["seconds"] for row in rows if row["run"] == reference_run)
     return [row | {column: row["seconds"] / unit} for row in rows]
 
 

@@ -47,15 +47,15 @@ Row = timing.Row
 HERE = Path(__file__).parent
 DOCS = HERE.parent / "docs"
 # Runs that take longer than this are not repeated (s).
-LONG = 3.0
+MAX_REPEATED_TIME = 3.0
 # Time limit of a load history (s).
-LIMIT = 20.0
+TIME_LIMIT = 20.0
 
 
 # ---- one run -------------------------------------------------------------------------------------
 
 
-def solve(body: ContactScene, setting: Setting, limit: float = LIMIT) -> Row:
+def solve(body: ContactScene, setting: Setting, limit: float = TIME_LIMIT) -> Row:
     """Solve the contact problem up to its full load; return the row without times."""
     made = problems.elasticity_problem(body, setting.degree)
     rule: dict[str, Any] = {}
@@ -126,7 +126,7 @@ def errors(row: Row, reference: Row) -> Row:
     return found | ({"error": max(found.values())} if found else {})
 
 
-def timed(one: Scene, setting: Setting, repeat: int, limit: float = LIMIT) -> Row:
+def time_setting(one: Scene, setting: Setting, repeat: int, limit: float = TIME_LIMIT) -> Row:
     """Time a setting and the linear problem in turn, several times if fast; return the minima."""
     body = one.make(setting.h)
     runs = {
@@ -137,7 +137,7 @@ def timed(one: Scene, setting: Setting, repeat: int, limit: float = LIMIT) -> Ro
     for _ in range(repeat):
         found.append(timing.measure(runs, repeat=1))
         row = found[-1][1]
-        if row["seconds"] > LONG or "failure" in row:
+        if row["seconds"] > MAX_REPEATED_TIME or "failure" in row:
             break
     linear, contact = (np.array([rows[i]["seconds"] for rows in found]) for i in range(2))
     return row | {
@@ -188,7 +188,7 @@ class Store:
         return self.rows[-1]
 
 
-def in_linear_solves(rows: Sequence[Row]) -> list[Row]:
+def add_relative_times(rows: Sequence[Row]) -> list[Row]:
     """Add times in units of the fastest linear solve of the same mesh."""
     units: dict[tuple[str, ...], float] = {}
     for row in rows:
@@ -225,7 +225,7 @@ def study(scenes: dict[str, Scene], store: Store, repeat: int, short: bool) -> N
                     costs.linear_solve(body, setting.degree)
                     solve(body, replace(setting, increments=min(2, setting.increments)))
                     warm.add(forms)
-                row = timed(one, setting, repeat)
+                row = time_setting(one, setting, repeat)
                 store.add("sweep", setting, row | errors(row, reference))
             bar.update()
 
@@ -236,7 +236,7 @@ def find_reference(one: Scene, store: Store) -> Row:
         return dict(one.published)
     row: Row | None = store.find("reference", one.reference)
     if row is None:
-        row = timed(one, one.reference, 1, limit=0.0)
+        row = time_setting(one, one.reference, 1, limit=0.0)
         if row.get("failure"):
             raise RuntimeError(f"the reference of {one.name} failed: {row['failure']}")
         row = store.add("reference", one.reference, row | errors(row, one.published))
@@ -261,7 +261,7 @@ def main() -> None:
             path.unlink(missing_ok=True)
         store = Store(path)
         study(scenes, store, arguments.repeat, arguments.short)
-        rows = in_linear_solves(store.rows)
+        rows = add_relative_times(store.rows)
         write(target.with_suffix(".csv"), rows)
     draw(target, scenes, rows)
     advice = "" if arguments.short else (HERE / "trade_advice.md").read_text()

@@ -15,11 +15,11 @@ from verification import report
 
 Row = timing.Row
 # A row dominates another if both its error and its time are smaller by this fraction.
-MARGIN = 0.1
+DOMINANCE_MARGIN = 0.1
 ENFORCEMENTS = (("penalty", "o-"), ("augmented", "s--"))
 
 
-def changed(row: Row, base: Setting) -> tuple[str, ...]:
+def find_changed_parameters(row: Row, base: Setting) -> tuple[str, ...]:
     """Return the parameters in which a row differs from the base setting."""
     return tuple(name for name in PARAMETERS if row[name] != str(getattr(base, name)))
 
@@ -28,22 +28,22 @@ def describe(row: Row, base: Setting) -> str:
     """Return the changed parameters with their values as text."""
     if row["accuracy"]:
         return f"accuracy = {row['accuracy']}"
-    names = [name for name in changed(row, base) if name not in ("h", "degree")]
+    names = [name for name in find_changed_parameters(row, base) if name not in ("h", "degree")]
     return ", ".join(f"{name} = {_short(row[name])}" for name in names) or "base"
 
 
-def comparable(row: Row, rows: Sequence[Row]) -> list[Row]:
+def find_comparable(row: Row, rows: Sequence[Row]) -> list[Row]:
     """Return the solved rows of a row's problem, mesh and degree: their times have one unit."""
     same = ("scene", "h", "degree")
-    return [r for r in rows if solved(r) and all(r[name] == row[name] for name in same)]
+    return [r for r in rows if is_solved(r) and all(r[name] == row[name] for name in same)]
 
 
-def solved(row: Row) -> bool:
+def is_solved(row: Row) -> bool:
     """Whether a row of the parameter study has a solution."""
     return row["role"] == "sweep" and row["error"] != ""
 
 
-def dominating(row: Row, rows: Sequence[Row], margin: float = MARGIN) -> list[Row]:
+def find_dominating(row: Row, rows: Sequence[Row], margin: float = DOMINANCE_MARGIN) -> list[Row]:
     """Return the rows whose error and time are both smaller by the margin."""
     return [
         other
@@ -52,7 +52,7 @@ def dominating(row: Row, rows: Sequence[Row], margin: float = MARGIN) -> list[Ro
     ]
 
 
-def front(rows: Sequence[Row]) -> list[Row]:
+def pareto_front(rows: Sequence[Row]) -> list[Row]:
     """Return the non-dominated rows (Pareto front), fastest first."""
     found: list[Row] = []
     for row in sorted(rows, key=lambda r: (float(r["time"]), float(r["error"]))):
@@ -215,10 +215,10 @@ def _grid(path: Path, scenes: Mapping[str, Scene], draw_one: Callable[[Any, Scen
 def _draw_settings(axes: Any, one: Scene, rows: Sequence[Row]) -> None:
     """Plot error over time of all settings on the base mesh."""
     base = one.base
-    here = comparable({"scene": one.name, "h": str(base.h), "degree": str(base.degree)}, rows)
+    here = find_comparable({"scene": one.name, "h": str(base.h), "degree": str(base.degree)}, rows)
     groups: dict[str, list[Row]] = {}
     for row in here:
-        names = changed(row, base)
+        names = find_changed_parameters(row, base)
         group = names[0] if len(names) == 1 else "several" if names else "base"
         groups.setdefault(f"accuracy = {row['accuracy']}" if row["accuracy"] else group, []).append(
             row
@@ -232,7 +232,7 @@ def _draw_settings(axes: Any, one: Scene, rows: Sequence[Row]) -> None:
             large = number <= len(presets)
             style = {"color": f"C{number % 10}", "markersize": 9 if large else 5, "alpha": 0.8}
             axes.loglog(*at, "sD^v<>ophd*XP8H.+"[number], label=name, **style)
-    best = front(here)
+    best = pareto_front(here)
     at = [[float(row[c]) for row in best] for c in ("time", "error")]
     axes.step(*at, "k-", where="post", linewidth=0.8, label="not dominated")
     axes.set(title=f"{one.name}, h = {_short(base.h)}", xlabel="time / linear solve")
@@ -254,7 +254,7 @@ def _draw_meshes(axes: Any, one: Scene, rows: Sequence[Row]) -> None:
                 replace(one.base, h=h, degree=degree, enforcement=enforcement) for h in one.sizes
             ]
             found = [row for setting in settings if (row := _row_of(setting, rows))]
-            found = [row for row in found if solved(row)]
+            found = [row for row in found if is_solved(row)]
             at = [[float(row[c]) for row in found] for c in ("dofs", "error")]
             label = f"degree {degree}, {enforcement}"
             axes.loglog(*at, line, color=f"C{degree - 1}", markersize=5, label=label)
@@ -292,4 +292,4 @@ def _varied(base: Setting, name: str, rows: Sequence[Row]) -> list[Row]:
     kind = type(getattr(base, name))
     values = sorted({kind(row[name]) for row in rows if row["scene"] == base.scene})
     found = [_row_of(replace(base, **{name: value}), rows) for value in values]
-    return [row for row in found if row and solved(row)]
+    return [row for row in found if row and is_solved(row)]

@@ -10,8 +10,8 @@ import pytest
 from mpi4py import MPI
 
 from scenes.comparison import is_close
-from verification.extreme_scenes import pressed, ranked
-from verification.extremes import METHODS, PAGE, Row, Trial, known, page, trials
+from verification.extreme_scenes import press_block, solve_on_ranks
+from verification.extremes import METHODS, PAGE, Row, Trial, all_trials, page, read_stored_rows
 
 COMM = MPI.COMM_WORLD
 # A quick selection of every group; all groups take minutes.
@@ -123,16 +123,17 @@ BODIES = {
     "number of increments": ("frictionless indentation in 1",),
 }
 REFUSED = ("load above the friction limit", "frictionless", "load × -1")
-FAST = [t for t in trials() if t.case in CHOSEN.get(t.group, ())]
+FAST = [t for t in all_trials() if t.case in CHOSEN.get(t.group, ())]
 LARGE = [
     dataclasses.replace(t, methods=(method,))
-    for t in trials()
+    for t in all_trials()
     for start, chosen in (("finite", FINITE), ("two bodies, finite", BODIES))
     for method in t.methods
     if t.case in chosen.get(t.group.removeprefix(f"{start} kinematics, "), ()) and not t.slow
 ]
 MORE = [
-    Trial("load path", f"load × {load:g}", pressed(10, load=load), "patch") for load in (1e3, -1.0)
+    Trial("load path", f"load × {load:g}", press_block(10, load=load), "patch")
+    for load in (1e3, -1.0)
 ]
 
 
@@ -170,16 +171,16 @@ def test_selected_trials_exist():
 @pytest.mark.parametrize("kind", ["disc", "two bodies"])
 def test_contact_on_one_rank_only(kind, method):
     """The solution does not depend on the partition, within 1e-8 (solver tolerance 1e-9)."""
-    _, rows, facets = ranked(kind, 10.0, 0.3, method)
+    _, rows, facets = solve_on_ranks(kind, 10.0, 0.3, method)
     assert np.count_nonzero(facets) == 1
-    _, spread, _ = ranked(kind, 10.0, 0.3, method, apart=False)
+    _, spread, _ = solve_on_ranks(kind, 10.0, 0.3, method, separate_ranks=False)
     assert is_close(rows, spread, 1e-8, scale=np.abs(rows[:, 2:]).max())
 
 
 def test_page_agrees_with_stored_rows():
     """The page agrees with the stored rows, which contain all trials."""
-    rows = known(PAGE.with_suffix(".csv"))
-    assert list(rows) == [(t.group, t.case, method) for t in trials() for method in t.methods]
+    rows = read_stored_rows(PAGE.with_suffix(".csv"))
+    assert list(rows) == [(t.group, t.case, method) for t in all_trials() for method in t.methods]
     assert page(list(rows.values())) == PAGE.read_text(encoding="utf-8")
 
 

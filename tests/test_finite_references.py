@@ -12,7 +12,7 @@ from fenics_contact.elasticity import NeoHookean
 from scenes import sliding_rubber_block
 from scenes.blocks import BOTTOM, LEFT, TOP, block_mesh
 from scenes.elasticity import dirichlet_bc, displacement_space
-from verification.extreme_finite import rotated_together
+from verification.extreme_finite import rotate_together
 
 pytestmark = pytest.mark.two_ranks
 
@@ -199,6 +199,6 @@ def test_body_rotated_with_its_tool_takes_few_iterations():
     The predictor follows body and tool: 228 iterations; 335 if it assumed the tool to be at rest,
     and 344 without following tools at all.
     """
-    steps, error = rotated_together(36)("newton")
+    steps, error = rotate_together(36)("newton")
     assert error < 1e-9
     assert sum(step.iterations for step in steps) <= 250

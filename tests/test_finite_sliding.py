@@ -24,7 +24,7 @@ from scenes.meshes import create_mesh
 from scenes.stacks import FLOOR, ROOF, SIDES, floor, joint, stack
 from scenes.tags import at_coordinate, tag_by_midpoints
 from scenes.two_blocks import BOTTOM, LOWER_FACE, TOP, UPPER_FACE, two_blocks
-from verification.extreme_bodies import Two
+from verification.extreme_bodies import TwoBlocks
 
 pytestmark = [pytest.mark.three_ranks, pytest.mark.hexahedra]
 
@@ -453,8 +453,12 @@ def test_bodies_in_touch_can_rotate_by_a_full_turn():
 
     Γc has two points, opposite to 20 facets of the other body; the penetration is 1e-14.
     """
-    both = Two("newton", mu=0.3, n=(40, 1), rounded=0.1)
-    steps = both.lead(0.0, 0.1, 2) + both.lead(0.05, 0.1, 2) + both.lead(0.05, 0.1, 36, 2 * np.pi)
+    both = TwoBlocks("newton", mu=0.3, n=(40, 1), edge_gap=0.1)
+    steps = (
+        both.move_to(0.0, 0.1, 2)
+        + both.move_to(0.05, 0.1, 2)
+        + both.move_to(0.05, 0.1, 36, 2 * np.pi)
+    )
     assert len(steps) == 40
     assert np.abs(both.force).max() < 1e-8
 

@@ -1,6 +1,6 @@
 """Tests of random scenes against an independent solver, of that solver and of the comparison.
 
-Tolerances of the comparison are those of ``verification/fuzz_judge.py``.
+Tolerances of the comparison are those of ``verification/fuzz_comparison.py``.
 """
 
 import copy
@@ -80,7 +80,9 @@ def test_scenes_of_finite_kinematics_are_right(number):
     assert outcome.outcome in FINE, f"{outcome}\n{json.dumps(scene)}"
     if COMM.size == 1:
         assert outcome.outcome == "right"
-        assert outcome.increments and {"equations", "independent", "nearest"} <= set(outcome.worst)
+        assert outcome.increments and {"equations", "independent", "nearest"} <= set(
+            outcome.error_ratios
+        )
 
 
 @pytest.mark.mpi
@@ -145,7 +147,7 @@ def test_most_scenes_are_solved_and_compared():
         wanted = {"equations", "nearest"} | (
             {"independent"} if seed not in (600094, 600209) else set()
         )
-        assert outcome.increments and wanted <= set(outcome.worst), seed
+        assert outcome.increments and wanted <= set(outcome.error_ratios), seed
 
 
 @pytest.mark.mpi
@@ -366,7 +368,7 @@ def test_correct_positioning_is_right():
     outcome = solve(LOOSE)
     assert outcome.outcome == "right"
     assert {"positioning rigid", "positioning depth", "positioning gap", "independent"} <= set(
-        outcome.worst
+        outcome.error_ratios
     )
 
 
@@ -627,7 +629,7 @@ def test_campaign_can_be_resumed(tmp_path):
 @serial
 def test_campaign_page_agrees_with_stored_outcomes():
     """The page in docs/ equals the one generated from the stored outcomes."""
-    assert campaigns.page(campaigns.campaigns()) == campaigns.PAGE.read_text()
+    assert campaigns.page(campaigns.read_campaigns()) == campaigns.PAGE.read_text()
 
 
 # ---- the independent solver ----------------------------------------------------------------------

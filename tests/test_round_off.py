@@ -142,7 +142,9 @@ def test_round_off_forces_after_unloading_are_accepted():
     grow when the block stays there. Reference: zero, to 1e-9 of the forces before.
     """
     scene = random_scenes.draw_small(940025, 940025 // random_scenes.FAMILY)
-    scene = {name: value for name, value in scene.items() if name not in random_scenes.SAID}
+    scene = {
+        name: value for name, value in scene.items() if name not in random_scenes.SOLVER_OPTIONS
+    }
     forces = []
 
     def take(record):

@@ -28,7 +28,7 @@ EXACT = {"V(1)": 300.0, "V(1.5)": 380.0, "H(1.5)": 120.0}
 
 def test_every_setting_has_a_stored_run() -> None:
     """Every setting has one row without failure."""
-    rows = study.stored(study.STUDY)
+    rows = study.read_rows(study.STUDY)
     assert {row["name"] for row in rows} == set(study.settings()) and not any(
         row["failure"] for row in rows
     )
@@ -41,7 +41,7 @@ def test_every_setting_has_a_stored_run() -> None:
 def test_rows_are_those_of_their_curves() -> None:
     """Evaluation of the curves gives the rows, to 1e-4 N/mm; curves have seven digits."""
     curves = study.curves()
-    for row in study.stored(study.STUDY):
+    for row in study.read_rows(study.STUDY):
         path = [dict(zip(("time", "V", "H"), point, strict=True)) for point in curves[row["name"]]]
         assert len(path) == int(row["increments done"])
         for name, value in study.evaluate(path).items():
@@ -59,7 +59,7 @@ def test_mesh_of_the_die_changes_forces_less_than_the_error(quantity: str, times
     """Refining or coarsening the die alone changes the forces by less than their errors."""
     rows = study.results()
     moved = page.differences(rows, quantity)[f"cells of the die {times} as large{page.COARSE}"]
-    _, error = page.converged(rows, quantity)
+    _, error = page.converged_value(rows, quantity)
     assert 0.0 < abs(moved) < error
 
 
@@ -74,7 +74,7 @@ def test_demo_has_the_published_range() -> None:
 @pytest.mark.parametrize("name", ["size 0.4", f"80 increments of pressing{page.COARSE}"])
 def test_runs_are_reproduced(name: str) -> None:
     """Forces are reproduced to 1e-6, with residuals of 1e-9."""
-    (row,) = (row for row in study.stored(study.STUDY) if row["name"] == name)
+    (row,) = (row for row in study.read_rows(study.STUDY) if row["name"] == name)
     found, _ = study.run(study.settings()[name])
     if found["dofs"] != int(row["dofs"]):
         pytest.skip("another gmsh makes another mesh")

@@ -47,10 +47,10 @@ def test_no_preset_is_dominated(preset: str, name: str) -> None:
     """
     rows = report.read(STUDY)
     row = next(r for r in rows if r["scene"] == name and r["accuracy"] == preset)
-    assert trade_page.solved(row), row["failure"]
-    others = trade_page.comparable(row, rows)
+    assert trade_page.is_solved(row), row["failure"]
+    others = trade_page.find_comparable(row, rows)
     assert len(others) > 30
-    better = trade_page.dominating(row, others)
+    better = trade_page.find_dominating(row, others)
     base = trade_scenes.all_scenes()[name].base
     assert not better, [(trade_page.describe(r, base), r["error"], r["time"]) for r in better]
     assert float(row["error"]) <= PRESETS[preset]

@@ -26,15 +26,15 @@ pytestmark = pytest.mark.mpi
 def test_quantities_agree_with_their_references(case):
     """Every quantity of a case is within its tolerance."""
     made = case.run()
-    missed = [row for row in made.rows if not row.passed]
+    missed = [row for row in made.rows if not row.is_met]
     assert made.rows and not missed, missed
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1.1])
 def test_errors_above_the_tolerance_do_not_pass(value):
     """NaN, infinity and errors above the tolerance do not pass."""
-    assert not Row("q", value, 1.0, "s", 0.05).passed
-    assert Row("q", 1.04, 1.0, "s", 0.05).passed
+    assert not Row("q", value, 1.0, "s", 0.05).is_met
+    assert Row("q", 1.04, 1.0, "s", 0.05).is_met
     assert Row("q", 0.04, 0.0, "s", 0.05).error == 0.04
 
 
@@ -92,7 +92,7 @@ def test_error_estimates_of_the_patch_test():
     found = list(statics.patch().estimates())
     assert len(found) == 6
     for e in found:
-        assert abs(e.estimated + e.true) <= 1.1 * e.true**2 + 1e-9, e
+        assert abs(e.estimated + e.true_error) <= 1.1 * e.true_error**2 + 1e-9, e
 
 
 @ONE_PROCESS
@@ -102,6 +102,6 @@ def test_effectivity_page_is_generated_from_the_stored_values():
     assert effectivity.page(rows) == effectivity.PAGE.read_text()
     stored = {row["case"] for row in rows}
     for case in CASES:
-        assert case.budget or case.name in stored, case.name
-    for name, *_ in effectivity.WHOLES:
+        assert case.reason_without_estimates or case.name in stored, case.name
+    for name, *_ in effectivity.TOTAL_ERROR_DEMOS:
         assert any(case.startswith(f"{name} ") for case in stored), name

@@ -23,7 +23,7 @@ SIZE = (100.0, 200.0)  # radius and height of the base
     "Punch with rounded edge, two bodies, NAFEMS R0094-2",
     "1 %: published values of two programs with coarse meshes at the edge; the mesh error here "
     "is less than 0.1 %",
-    budget="point displacements are not in the error budget",
+    reason_without_estimates="point displacements are not in the error budget",
 )
 def punch(h: float = 1.0) -> Outcome:
     """Press a flat steel punch with a fillet on aluminium by 100 MPa.

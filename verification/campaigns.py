@@ -50,7 +50,7 @@ REASONS = {
 Row = dict[str, str]
 
 
-def campaigns() -> dict[str, list[Row]]:
+def read_campaigns() -> dict[str, list[Row]]:
     """Return the rows of every campaign by its title."""
     files = {name: report.read(DATA / name) for name, _ in CAMPAIGNS.values()}
     return {
@@ -59,12 +59,16 @@ def campaigns() -> dict[str, list[Row]]:
     }
 
 
-def page(found: dict[str, list[Row]]) -> str:
+def page(rows_by_campaign: dict[str, list[Row]]) -> str:
     """Return the page in Markdown."""
-    counts = {title: Counter(row["outcome"] for row in rows) for title, rows in found.items()}
-    total = sum(map(len, found.values()))
+    counts = {
+        title: Counter(row["outcome"] for row in rows) for title, rows in rows_by_campaign.items()
+    }
+    total = sum(map(len, rows_by_campaign.values()))
     wrong = sum(count["wrong"] for count in counts.values())
-    increments = sum(int(row["increments"] or 0) for rows in found.values() for row in rows)
+    increments = sum(
+        int(row["increments"] or 0) for rows in rows_by_campaign.values() for row in rows
+    )
     lines = ["# Random scenes", ""]
     lines += report.text(
         f"**{wrong} of {total} random scenes had a wrong result when they were run**, of which 4 "
@@ -74,7 +78,10 @@ def page(found: dict[str, list[Row]]) -> str:
     )
     lines += ["![Outcomes by campaign](random_scenes.png)", ""]
     names = [label for label, _ in OUTCOMES.values()]
-    body = [(title, len(found[title]), *(counts[title][o] for o in OUTCOMES)) for title in found]
+    body = [
+        (title, len(rows_by_campaign[title]), *(counts[title][o] for o in OUTCOMES))
+        for title in rows_by_campaign
+    ]
     lines += report.table(("campaign", "scenes", *names), body)
     lines += report.text(
         '*"Other equilibrium": another solution for the same loads, which friction permits. '
@@ -113,7 +120,8 @@ def page(found: dict[str, list[Row]]) -> str:
         "of up to 20 times the width.",
     )
     lines += ["## Wrong results", ""]
-    later = found["the same, later"]
+    later = rows_by_campaign["the same, later"]
+    latest = rows_by_campaign["the same, latest"]
     solved = sum(row["kind"] == "NotConverged: not converged (solved apart)" for row in later)
     required = sum("rightly" in row["kind"] for row in later)
     lines += report.text(
@@ -139,7 +147,7 @@ def page(found: dict[str, list[Row]]) -> str:
         "facets passed through the obstacle between the points of vertex quadrature (814618): both "
         "are refused now. In one a point is 1e-9 of the length away from the vertex of a polygon, "
         "whose normal there has a round-off of 5e-8 (815370).",
-        f"- Of the {len(found['the same, latest'])} latest mixed scenes three were wrong. For a "
+        f"- Of the {len(latest)} latest mixed scenes three were wrong. For a "
         "body that slides back onto its obstacle from beyond its end the first contact in the "
         "increment was detected too late (817254); it is correct now. The independent solver "
         "allowed a slanted rod no more depth at the corner of a coarse body than a flat one "
@@ -157,7 +165,7 @@ def page(found: dict[str, list[Row]]) -> str:
         "a stiff one (`tests/test_scales.py`), and a displacement of 1e-12 at Dirichlet nodes.",
     )
     lines += ["## Refusals", ""]
-    rows = [r for r in found["small displacements"] if r["outcome"] == "refused"]
+    rows = [r for r in rows_by_campaign["small displacements"] if r["outcome"] == "refused"]
     kinds = Counter(row["kind"] for row in rows)
     body = [
         (
@@ -205,29 +213,31 @@ def page(found: dict[str, list[Row]]) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def draw(path: Path, found: dict[str, list[Row]]) -> None:
+def draw_outcomes(path: Path, rows_by_campaign: dict[str, list[Row]]) -> None:
     """Draw the fractions of the outcomes of every campaign."""
-    titles = [f"{title} ({len(rows)})" for title, rows in found.items()]
+    titles = [f"{title} ({len(rows)})" for title, rows in rows_by_campaign.items()]
     with plotting.figure(path, size=(9.0, 3.4)) as axes:
-        left = [0.0] * len(found)
+        left = [0.0] * len(rows_by_campaign)
         for outcome, (label, colour) in OUTCOMES.items():
             widths = [
                 100 * sum(row["outcome"] == outcome for row in rows) / len(rows)
-                for rows in found.values()
+                for rows in rows_by_campaign.values()
             ]
             if any(widths):
-                axes.barh(range(len(found)), widths, left=left, color=colour, label=label)
+                axes.barh(
+                    range(len(rows_by_campaign)), widths, left=left, color=colour, label=label
+                )
             left = [a + b for a, b in zip(left, widths, strict=True)]
-        axes.set_yticks(range(len(found)), titles, fontsize=8)
-        axes.set(xlabel="scenes [%]", xlim=(0, 100), ylim=(len(found) - 0.4, -0.6))
+        axes.set_yticks(range(len(rows_by_campaign)), titles, fontsize=8)
+        axes.set(xlabel="scenes [%]", xlim=(0, 100), ylim=(len(rows_by_campaign) - 0.4, -0.6))
         axes.figure.legend(loc="outside upper right", ncols=6, fontsize=8)
 
 
 def main() -> int:
     """Write the page and its figure."""
-    found = campaigns()
-    PAGE.write_text(page(found))
-    draw(PAGE.with_suffix(".png"), found)
+    rows_by_campaign = read_campaigns()
+    PAGE.write_text(page(rows_by_campaign))
+    draw_outcomes(PAGE.with_suffix(".png"), rows_by_campaign)
     return 0
 
 

@@ -37,7 +37,7 @@ class Row:
         return abs(self.obtained - self.reference) / (abs(self.reference) or 1.0)
 
     @property
-    def passed(self) -> bool:
+    def is_met(self) -> bool:
         """Whether the error is within the tolerance; False for NaN."""
         return bool(self.error <= self.tolerance)
 
@@ -50,16 +50,16 @@ class Estimate:
         quantity: Name in the budget.
         budget: The budget.
         exact: Exact value of the modelled part.
-        known: Relative uncertainty of the exact value.
+        reference_uncertainty: Relative uncertainty of the exact value.
     """
 
     quantity: str
     budget: fc.ErrorBudget
     exact: float
-    known: float = 1e-9
+    reference_uncertainty: float = 1e-9
 
     @property
-    def true(self) -> float:
+    def true_error(self) -> float:
         """True error relative to the computed value."""
         value = self.budget.values[self.quantity]
         return (value - self.exact) / value
@@ -80,7 +80,7 @@ class Outcome:
         dofs: Number of dofs of the largest run.
         seconds: Wall time.
         estimates: Yields error estimates of the last state; collective. None if there is nothing
-            to compare them with, see `Case.budget`.
+            to compare them with, see `Case.reason_without_estimates`.
     """
 
     rows: tuple[Row, ...]
@@ -90,9 +90,9 @@ class Outcome:
     estimates: Callable[[], Iterator[Estimate]] | None = None
 
     @property
-    def passed(self) -> bool:
+    def is_met(self) -> bool:
         """Whether every quantity meets its reference."""
-        return all(row.passed for row in self.rows)
+        return all(row.is_met for row in self.rows)
 
 
 @dataclass(frozen=True)
@@ -104,14 +104,14 @@ class Case:
         reason: Reason of the tolerances.
         compute: Function that solves the case; collective.
         slow: Whether it takes more than some seconds.
-        budget: Why error estimates cannot be compared with a true error.
+        reason_without_estimates: Why error estimates cannot be compared with a true error.
     """
 
     name: str
     reason: str
     compute: Callable[[], Outcome]
     slow: bool = False
-    budget: str = ""
+    reason_without_estimates: str = ""
 
     def run(self) -> Outcome:
         """Solve the case, and measure the time. Collective."""
@@ -124,12 +124,12 @@ _cases: list[Case] = []
 
 
 def case(
-    name: str, reason: str, *, slow: bool = False, budget: str = ""
+    name: str, reason: str, *, slow: bool = False, reason_without_estimates: str = ""
 ) -> Callable[..., Callable[[], Outcome]]:
     """Register a computation as a case of its module."""
 
     def enter(compute: Callable[[], Outcome]) -> Callable[[], Outcome]:
-        _cases.append(Case(name, reason, compute, slow, budget))
+        _cases.append(Case(name, reason, compute, slow, reason_without_estimates))
         return compute
 
     return enter

@@ -46,7 +46,7 @@ def demo(
     *options: str,
     source: Mapping[str, str],
     label: str = "",
-    budget: str = "",
+    reason_without_estimates: str = "",
 ) -> Case:
     """Create a case from a demo that writes value, reference and tolerance under "references".
 
@@ -57,7 +57,7 @@ def demo(
         options: Options of the command line.
         source: Sources of the references by a word of the quantity; the first match is used.
         label: Key of the results that distinguishes the runs.
-        budget: Why error estimates cannot be compared with a true error.
+        reason_without_estimates: Why error estimates cannot be compared with a true error.
     """
 
     def compute() -> Outcome:
@@ -76,7 +76,9 @@ def demo(
         dofs = max(one.get("dofs", 0) for one in made)
         return Outcome(tuple(rows), " ".join([f"demos/{name}.py", *options]), dofs)
 
-    return Case(title, reason, compute, slow=True, budget=budget)
+    return Case(
+        title, reason, compute, slow=True, reason_without_estimates=reason_without_estimates
+    )
 
 
 EXACT = "exact complementarity, converged"
@@ -115,11 +117,11 @@ def half_cylinder_at_once() -> Outcome:
     (one,) = runs(run("hertz", *options))
     # The stick zone ends at 0.23 a, known to 0.01 a; quadrature points are h/3 apart.
     stick = 0.23 * one["half_width"]
-    place = (0.005 * one["half_width"] + 0.05 / 3) / stick
+    tolerance = (0.005 * one["half_width"] + 0.05 / 3) / stick
     rows = (
         Row("tangential resultant per half", one["tangential_resultant"], 38.99, EXACT, 0.01),
         Row("max tangential traction", one["max_tangential_traction"], 29.3, EXACT, 0.02),
-        Row("stick half width", one["stick_half_width"], stick, EXACT, place),
+        Row("stick half width", one["stick_half_width"], stick, EXACT, tolerance),
     )
     return Outcome(rows, "demos/hertz.py " + " ".join(options), one["dofs"])
 
@@ -184,7 +186,7 @@ DEMOS = [
         "quadrature points",
         half_cylinder_at_once,
         slow=True,
-        budget="the single increment is prescribed, not an error",
+        reason_without_estimates="the single increment is prescribed, not an error",
     ),
     Case(
         "Half-cylinder on a plane, a/R = 0.048",
@@ -222,7 +224,7 @@ DEMOS = [
         "1 % for energies; 3 % for the residual shear traction, a difference of two curves",
         "fretting",
         source={"closing": "closed loop", "": "Mindlin, Deresiewicz"},
-        budget="energies and point values are not in the error budget",
+        reason_without_estimates="energies and point values are not in the error budget",
     ),
     demo(
         "Shrink fit",
@@ -250,7 +252,7 @@ DEMOS = [
         "both t/R; 2 % for the pressure, 0.5 % for the torque: t/R",
         "capstan",
         source={"torque": "equilibrium", "p R": "equilibrium", "": "Eytelwein, μπ"},
-        budget="the formula is accurate to t/(2R), which exceeds the error",
+        reason_without_estimates="the formula is accurate to t/(2R), which exceeds the error",
     ),
     demo(
         "O-ring between plates and in a groove, finite kinematics",
@@ -263,7 +265,7 @@ DEMOS = [
             "reaction": "equilibrium",
             "": "half the mesh size",
         },
-        budget="the formula is a fit, less accurate than the solution",
+        reason_without_estimates="the formula is a fit, less accurate than the solution",
     ),
     demo(
         "Tapered pin: insertion, release, extraction, finite kinematics",
@@ -280,7 +282,7 @@ DEMOS = [
             "extraction force": "Lamé, Coulomb",
             "": "Lamé",
         },
-        budget="uncovered ends and axial displacements exceed the error",
+        reason_without_estimates="uncovered ends and axial displacements exceed the error",
     ),
     demo(
         "Screw in a rubber nut, finite kinematics",
@@ -288,7 +290,7 @@ DEMOS = [
         "pressure, and (width/R)²",
         "screw",
         source={"μ = 0": "work: M = F P", "": "square thread: tan(α ± φ)"},
-        budget="results follow from statics",
+        reason_without_estimates="results follow from statics",
     ),
     demo(
         "Rubber ring rotating on a disc (clutch), finite kinematics",
@@ -301,7 +303,7 @@ DEMOS = [
             "rotating": "frame indifference",
             "": "Coulomb",
         },
-        budget="results follow from statics",
+        reason_without_estimates="results follow from statics",
     ),
     demo(
         "Rubber tube compressed to self-contact, finite kinematics",
@@ -313,8 +315,8 @@ DEMOS = [
             "compliance": "Winkler's curved beam, Timoshenko",
             "": "quarter model on a rigid plane",
         },
-        budget="forces are compared between models with equal errors, compliances with beam "
-        "theory, less accurate than the solution",
+        reason_without_estimates="forces are compared between models with equal errors, "
+        "compliances with beam theory, less accurate than the solution",
     ),
     demo(
         "Disc pressed into rubber, rotated and slid, finite kinematics",
@@ -326,20 +328,21 @@ DEMOS = [
             "full slip": "Coulomb",
             "": "GetFEM 5.4.2, same mesh",
         },
-        budget="the other program has the same mesh and penalty, and the same errors",
+        reason_without_estimates="the other program has the same mesh and penalty, and the same "
+        "errors",
     ),
     demo(
         "Male–female fitting",
         "1e-7: solver tolerance; 1e-8 for homogeneity",
         "fitting",
         source={"difference": "homogeneity", "": "statics"},
-        budget="results follow from statics, up to round-off",
+        reason_without_estimates="results follow from statics, up to round-off",
     ),
     demo(
         "Block on a rigid incline; wedge",
         "1e-4: resolution of the bisection; 1e-6 for the wedge: statics",
         "incline",
         source={"F/G": "NAFEMS CGS-4: (tan α + μ)/(1 - μ tan α)", "": "statics: tan α = μ"},
-        budget="results follow from statics, up to round-off",
+        reason_without_estimates="results follow from statics, up to round-off",
     ),
 ]

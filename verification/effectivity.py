@@ -36,9 +36,9 @@ from verification.demonstrations import DEMOS, run, runs
 from verification.run import CASES
 
 PAGE = ROOT / "docs" / "effectivity.md"
-USEFUL = (0.3, 3.0)
+EFFECTIVITY_RANGE = (0.3, 3.0)
 # Relative errors below this are not resolved by the more accurate solution.
-KNOWN = 1e-6
+RESOLVED_ERROR = 1e-6
 
 
 @dataclass(frozen=True)
@@ -50,21 +50,25 @@ class Row:
         part: Part of the error budget.
         quantity: Quantity of the budget.
         estimated: Estimated error.
-        true: True error.
-        known: Uncertainty of the reference, below which the true error is unknown.
+        true_error: True error.
+        reference_uncertainty: Uncertainty of the reference, below which the true error is unknown.
     """
 
     scene: str
     part: str
     quantity: str
     estimated: float
-    true: float
-    known: float = 0.0
+    true_error: float
+    reference_uncertainty: float = 0.0
 
     @property
     def effectivity(self) -> float | None:
         """Absolute value of estimated over true error; None if the true error is unknown."""
-        return abs(self.estimated / self.true) if abs(self.true) > self.known else None
+        return (
+            abs(self.estimated / self.true_error)
+            if abs(self.true_error) > self.reference_uncertainty
+            else None
+        )
 
 
 def half_cylinder(
@@ -97,7 +101,7 @@ def part(
     values, budget = rough
     for quantity, value in values.items():
         true = (value - better[quantity]) / value
-        if abs(true) > KNOWN:
+        if abs(true) > RESOLVED_ERROR:
             yield Row(scene, name, quantity, budget.parts[name][quantity] / value, true)
 
 
@@ -133,7 +137,7 @@ PEAK = 151.87
 # Demo, options, exact or converged values (numbers, or names of the demo's references), and their
 # relative uncertainty.
 Truths = dict[str, str | float]
-WHOLES: list[tuple[str, tuple[str, ...], Truths, float]] = [
+TOTAL_ERROR_DEMOS: list[tuple[str, tuple[str, ...], Truths, float]] = [
     *(
         ("hertz", ("--friction", f, "--h", h, "--degree", p, "--increments", n), truth, 1e-3)
         for f, n, truth in (
@@ -198,9 +202,9 @@ WHOLES: list[tuple[str, tuple[str, ...], Truths, float]] = [
 ]
 
 
-def of_demos() -> Iterator[Row]:
+def demo_rows() -> Iterator[Row]:
     """Yield the total errors of the demos, compared with exact or converged values."""
-    for name, options, truths, known in WHOLES:
+    for name, options, truths, uncertainty in TOTAL_ERROR_DEMOS:
         for one in runs(run(name, *options, "--errors")):
             budget = fc.ErrorBudget(**one["errors"])
             references = one["references"]
@@ -219,18 +223,20 @@ def of_demos() -> Iterator[Row]:
                 # The references also assume small displacements.
                 parts = {n: p for n, p in budget.parts.items() if n != "kinematics"}
                 total = dataclasses.replace(budget, parts=parts).total[quantity]
-                yield Row(label, "all parts", quantity, total, true, known)
+                yield Row(label, "all parts", quantity, total, true, uncertainty)
 
 
-def of_cases() -> Iterator[Row]:
+def case_rows() -> Iterator[Row]:
     """Yield the total errors of the other cases, and of two of them on coarser meshes."""
 
     def rows(title: str, made: Outcome) -> Iterator[Row]:
         for e in made.estimates() if made.estimates else ():
-            yield Row(title, "all parts", e.quantity, e.estimated, e.true, e.known)
+            yield Row(
+                title, "all parts", e.quantity, e.estimated, e.true_error, e.reference_uncertainty
+            )
 
     for case in CASES:
-        if not case.budget:
+        if not case.reason_without_estimates:
             yield from rows(case.name, case.run())
     for n in (32, 64):
         yield from rows(f"Wavy surface, {n} cells", half_planes.wavy(n))
@@ -243,21 +249,22 @@ def of_cases() -> Iterator[Row]:
 def stored(row: Row) -> dict[str, Any]:
     """Return a row as it is written to the CSV file."""
     found: dict[str, Any] = {"part": row.part, "case": row.scene, "quantity": row.quantity}
-    found |= {"estimated [%]": 100 * row.estimated, "true [%]": 100 * row.true}
+    found |= {"estimated [%]": 100 * row.estimated, "true [%]": 100 * row.true_error}
     if row.effectivity is None:
         return found | {"effectivity": "", "useful": ""}
-    useful = USEFUL[0] <= row.effectivity <= USEFUL[1]
+    useful = EFFECTIVITY_RANGE[0] <= row.effectivity <= EFFECTIVITY_RANGE[1]
     return found | {"effectivity": row.effectivity, "useful": "yes" if useful else "no"}
 
 
 def page(rows: list[dict[str, str]]) -> str:
     """Return the page in Markdown."""
     known = [row for row in rows if row["useful"]]
+    low, high = EFFECTIVITY_RANGE
     bad = [row for row in known if row["useful"] == "no"]
     lines = ["# Effectivity of the error estimates", ""]
     lines += report.text(
-        f"**{len(known) - len(bad)} of {len(known)} effectivities are between {USEFUL[0]:g} and "
-        f"{USEFUL[1]:g}.** The effectivity is the estimated over the true error, both relative to "
+        f"**{len(known) - len(bad)} of {len(known)} effectivities are between {low:g} and "
+        f"{high:g}.** The effectivity is the estimated over the true error, both relative to "
         "the quantity.",
         "Each part of the error budget (enforcement, discretisation, solver, increments) is "
         "compared with a solution in which its cause is nearly absent, all else being equal. All "
@@ -270,17 +277,17 @@ def page(rows: list[dict[str, str]]) -> str:
         found = effectivities(rows, name)
         useful = sum(row["useful"] == "yes" for row in known if row["part"] == name)
         body.append((name, len(found), f"{statistics.median(found):.2f}", useful))
-    between = f"between {USEFUL[0]:g} and {USEFUL[1]:g}"
+    between = f"between {low:g} and {high:g}"
     lines += report.table(("part", "estimates", "median effectivity", between), body)
     lines += ["![Estimated over true error](effectivity.png)", ""]
     lines += report.text(
-        f"*Estimated and true errors, and the range {USEFUL[0]:g} to {USEFUL[1]:g} of the "
+        f"*Estimated and true errors, and the range {low:g} to {high:g} of the "
         "effectivity. Errors below 0.005 % are not drawn. Grey: the true error is "
         "below the uncertainty of the reference (0.1 % for converged values, (a/R)² for Hertz); "
         f"these {len(rows) - len(known)} are not counted. The peak pressure of the half-cylinder "
         f"with friction is that of finer meshes, {PEAK:g}.*"
     )
-    lines += [f"## Effectivities below {USEFUL[0]:g} or above {USEFUL[1]:g}", ""]
+    lines += [f"## Effectivities below {low:g} or above {high:g}", ""]
     columns = ("part", "case", "quantity", "estimated [%]", "true [%]", "effectivity")
     shown = [
         [
@@ -296,7 +303,10 @@ def page(rows: list[dict[str, str]]) -> str:
         "values are in [effectivity.csv](effectivity.csv)."
     )
     lines += ["## Verification cases without estimates", ""]
-    lines += report.table(("case", "reason"), [(case.name, case.budget) for case in without()])
+    lines += report.table(
+        ("case", "reason"),
+        [(case.name, case.reason_without_estimates) for case in cases_without_estimates()],
+    )
     lines += report.text(
         "Written by `python verification/effectivity.py`; `--page` writes the page and its figure "
         "from the stored values."
@@ -322,7 +332,7 @@ def draw(path: Path, rows: list[dict[str, str]]) -> None:
                 label = name if known else None
                 axes.loglog(*at, marker, color=colour, markersize=5, alpha=0.7, label=label)
         axes.loglog(ends, ends, "k-", linewidth=1, label="effectivity 1")
-        for factor in USEFUL:
+        for factor in EFFECTIVITY_RANGE:
             axes.loglog(ends, factor * ends, "k:", linewidth=1)
         axes.set(xlabel="true error [%]", ylabel="estimated error [%]", xlim=ends, ylim=ends)
         axes.grid(alpha=0.25)
@@ -334,9 +344,9 @@ def effectivities(rows: list[dict[str, str]], name: str) -> list[float]:
     return [float(row["effectivity"]) for row in rows if row["part"] == name and row["useful"]]
 
 
-def without() -> list[Case]:
+def cases_without_estimates() -> list[Case]:
     """Return the cases without reference values for error estimates."""
-    return [case for case in DEMOS + CASES if case.budget]
+    return [case for case in DEMOS + CASES if case.reason_without_estimates]
 
 
 def main() -> int:
@@ -348,7 +358,7 @@ def main() -> int:
     data = arguments.output.with_suffix(".csv")
     if not arguments.page:
         made = []
-        for source in (parts, of_demos, of_cases):
+        for source in (parts, demo_rows, case_rows):
             for row in source():
                 made.append(stored(row))
                 print(*made[-1].values(), sep="; ", flush=True)
@@ -357,7 +367,9 @@ def main() -> int:
     arguments.output.write_text(page(rows))
     draw(arguments.output.with_suffix(".png"), rows)
     medians = [statistics.median(effectivities(rows, name)) for name in {r["part"] for r in rows}]
-    return int(not all(USEFUL[0] <= median <= USEFUL[1] for median in medians))
+    return int(
+        not all(EFFECTIVITY_RANGE[0] <= median <= EFFECTIVITY_RANGE[1] for median in medians)
+    )
 
 
 if __name__ == "__main__":

@@ -23,21 +23,29 @@ from scenes.elasticity import dirichlet_bc, displacement_space
 from scenes.rubber import TIGHT_TOLERANCE, rubber
 from scenes.tags import any_of, at_coordinate, at_interface
 from verification import sliding_reference, sliding_scenes
-from verification.extreme_finite import NU, E, bisect, nominal, relative, solved_twice, stress
+from verification.extreme_finite import (
+    NU,
+    E,
+    bisect,
+    compare_with_independent_solver,
+    nominal,
+    relative_error,
+    stress,
+)
 from verification.extreme_scenes import Array, Solve, friction_law
-from verification.sliding_scenes import turn
+from verification.sliding_scenes import rotation_matrix
 
 BOTTOM, TOP, LOWER, UPPER, LEFT, RIGHT = 1, 2, 3, 4, 5, 6
-DOWN = 0.1  # approach of the blocks
+APPROACH = 0.1  # approach of the blocks
 
 
-class Two:
+class TwoBlocks:
     """Two rubber blocks in plane strain, each of height 1.
 
     Attributes:
         u, contact, problem: Displacement, contact and problem.
-        at: Lateral and downward displacement of the top, and rotation of both ends (rad).
-        push: Pressure on the top.
+        position: Lateral and downward displacement of the top, and rotation of both ends (rad).
+        pressure: Pressure on the top.
     """
 
     def __init__(
@@ -51,10 +59,10 @@ class Two:
         n: tuple[int, int] = (8, 6),
         rows: int = 4,
         moduli: tuple[float, float] = (E, E),
-        own: int = UPPER,
-        rounded: float = 0.0,
+        slave_tag: int = UPPER,
+        edge_gap: float = 0.0,
         gap: float = 0.0,
-        ends: str = "led",
+        ends: str = "prescribed",
         points: int | None = None,
     ) -> None:
         """Create the unloaded blocks. Collective.
@@ -68,12 +76,12 @@ class Two:
             n: Numbers of cells along the widths.
             rows: Number of cells over the height of each block.
             moduli: Young's moduli.
-            own: Tag of Γc, `LOWER` or `UPPER`.
-            rounded: Gap at the ends due to the curvature of the upper block.
+            slave_tag: Tag of Γc, `LOWER` or `UPPER`.
+            edge_gap: Gap at the ends due to the curvature of the upper block.
             gap: Initial gap.
-            ends: "led": all displacements of bottom and top are prescribed; "smooth": vertical
-                ones, and symmetry at the left sides; "confined": symmetry at the right sides, too;
-                "pushed": bottom fixed, top fixed horizontally.
+            ends: "prescribed": all displacements of bottom and top are prescribed; "frictionless":
+                vertical ones, and symmetry at the left sides; "confined": symmetry at the right
+                sides, too; "force": bottom fixed, top fixed horizontally.
             points: Quadrature points per facet of Γc.
         """
         lefts = (0.0, start)
@@ -92,35 +100,35 @@ class Two:
         upper = dolfinx.mesh.compute_midpoints(mesh, 2, cells)[:, 1] > 1.0
         x, lifted = mesh.geometry.x, np.unique(compat.geometry_dofmap(mesh)[upper])
         away = 2 * (x[lifted, 0] - start) / widths[1] - 1
-        x[lifted, 1] += gap + rounded * away**2 * (2.0 - x[lifted, 1])
+        x[lifted, 1] += gap + edge_gap * away**2 * (2.0 - x[lifted, 1])
         modulus = fem.Function(fem.functionspace(mesh, ("DG", 0)))
         modulus.x.array[:] = np.where(upper, moduli[1], moduli[0])
         self.u = u = fem.Function(displacement_space(mesh, 1))
         V, v = u.function_space, ufl.TestFunction(u.function_space)
-        self.at, self.push = np.zeros(3), fem.Constant(mesh, 0.0)
-        self._top, self._led = [fem.Constant(mesh, 0.0) for _ in range(2)], []
-        if ends == "led":
+        self.position, self.pressure = np.zeros(3), fem.Constant(mesh, 0.0)
+        self._top, self._prescribed = [fem.Constant(mesh, 0.0) for _ in range(2)], []
+        if ends == "prescribed":
             for tag in (BOTTOM, TOP):
                 dofs = fem.locate_dofs_topological(V, 1, tags.find(tag))
-                self._led.append(fem.dirichletbc(fem.Function(V), dofs))
-        bcs = list(self._led)
-        if ends == "pushed":
+                self._prescribed.append(fem.dirichletbc(fem.Function(V), dofs))
+        bcs = list(self._prescribed)
+        if ends == "force":
             bcs = [dirichlet_bc(u, tags, BOTTOM, i) for i in range(2)] + [
                 dirichlet_bc(u, tags, TOP, 0)
             ]
-        elif ends != "led":
+        elif ends != "prescribed":
             bcs = [dirichlet_bc(u, tags, BOTTOM, 1), dirichlet_bc(u, tags, TOP, 1, self._top[1])]
             bcs += [
                 dirichlet_bc(u, tags, side, 0) for side in (LEFT, RIGHT)[: 1 + (ends == "confined")]
             ]
         body = NeoHookean(u, modulus, NU, "plane strain")
         ds = ufl.ds(mesh, subdomain_data=tags)
-        F = body.residual(v) + self.push * v[1] * ds(TOP)
+        F = body.residual(v) + self.pressure * v[1] * ds(TOP)
         degree = None if points is None else 2 * points - 1
         self.contact = fc.Contact(
             u,
-            fc.ContactSurface(mesh, tags, own, quadrature_degree=degree),
-            fc.DeformableBody(tags, LOWER if own == UPPER else UPPER),
+            fc.ContactSurface(mesh, tags, slave_tag, quadrature_degree=degree),
+            fc.DeformableBody(tags, LOWER if slave_tag == UPPER else UPPER),
             friction_law(mu, kappa * min(moduli) * rows),
             kinematics="finite",
         )
@@ -133,45 +141,45 @@ class Two:
         """Contact force on the body with Γc, (2,)."""
         return self.contact.resultants().force
 
-    def place(self, sideways: float, down: float, angle: float) -> None:
+    def set_position(self, sideways: float, down: float, angle: float) -> None:
         """Set the displacement of the top, and the rotation of bottom and top about the origin."""
         self._top[1].value = -down
-        for bc, offset in zip(self._led, ((0.0, 0.0), (sideways, -down)), strict=False):
+        for bc, offset in zip(self._prescribed, ((0.0, 0.0), (sideways, -down)), strict=False):
             x = self.u.function_space.tabulate_dof_coordinates()[:, :2]
-            bc.g.x.array[:] = ((x + offset) @ turn(2, angle).T - x).ravel()
+            bc.g.x.array[:] = ((x + offset) @ rotation_matrix(2, angle).T - x).ravel()
 
-    def lead(
+    def move_to(
         self, sideways: float, down: float, steps: int, angle: float = 0.0, **options: Any
     ) -> list[fc.Step]:
         """Move the blocks in equal increments to a displacement and an angle. Collective."""
-        start, end = self.at, np.array([sideways, down, angle])
+        start, end = self.position, np.array([sideways, down, angle])
 
         def load(t: float) -> None:
-            self.place(*(start + t * (end - start)))
+            self.set_position(*(start + t * (end - start)))
 
         made = list(fc.increments(self.problem, load, steps=steps, **options))
-        self.at = end
+        self.position = end
         return made
 
 
 # ---- rotation and sliding ------------------------------------------------------------------------
 
 
-def rotated_together(steps: int, mu: float = 0.3, angle: float = 2 * np.pi, **two: Any) -> Solve:
+def rotate_together(steps: int, mu: float = 0.3, angle: float = 2 * np.pi, **two: Any) -> Solve:
     """Press and slide, then rotate both blocks; reference: the rotated tractions."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
-        both = Two(method, mu=mu, rounded=0.1, **two)
-        made = both.lead(0.0, DOWN, 2) + both.lead(0.05, DOWN, 2)
+        both = TwoBlocks(method, mu=mu, edge_gap=0.1, **two)
+        made = both.move_to(0.0, APPROACH, 2) + both.move_to(0.05, APPROACH, 2)
         before = point_values(both.contact, both.contact.traction)
-        made += both.lead(0.05, DOWN, steps, angle)
+        made += both.move_to(0.05, APPROACH, steps, angle)
         now = point_values(both.contact, both.contact.traction)
-        return made, relative(now, before @ turn(2, angle).T)
+        return made, relative_error(now, before @ rotation_matrix(2, angle).T)
 
     return solve
 
 
-def slide_over_facets(n: int, steps: int, mu: float, wide: int = 50) -> Solve:
+def slide_over_facets(n: int, steps: int, mu: float, n_upper: int = 50) -> Solve:
     """Slide along a block of n facets, over more than half of them.
 
     Reference: the force at a tenth of the path, a whole number of facets before. The ends of the
@@ -181,16 +189,16 @@ def slide_over_facets(n: int, steps: int, mu: float, wide: int = 50) -> Solve:
         n: Number of facets of the lower block, whose length is 20.
         steps: Number of increments.
         mu: Friction coefficient.
-        wide: Number of facets of the upper block, whose length is 1.
+        n_upper: Number of facets of the upper block, whose length is 1.
     """
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
-        both = Two(method, mu=mu, widths=(20.0, 1.0), start=4.0, n=(n, wide), rows=2)
-        made = both.lead(0.0, DOWN, 2)
-        made += both.lead(1.1, DOWN, max(1, steps // 10))
+        both = TwoBlocks(method, mu=mu, widths=(20.0, 1.0), start=4.0, n=(n, n_upper), rows=2)
+        made = both.move_to(0.0, APPROACH, 2)
+        made += both.move_to(1.1, APPROACH, max(1, steps // 10))
         first = both.force
-        made += both.lead(11.0, DOWN, steps)
-        return made, relative(both.force, first)
+        made += both.move_to(11.0, APPROACH, steps)
+        return made, relative_error(both.force, first)
 
     return solve
 
@@ -202,15 +210,15 @@ def slide_off(mu: float, steps: int, **two: Any) -> Solve:
     """
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
-        both = Two(method, mu=mu, **two)
-        made = both.lead(0.0, 0.5 * DOWN, 1)
+        both = TwoBlocks(method, mu=mu, **two)
+        made = both.move_to(0.0, 0.5 * APPROACH, 1)
         first = both.force
-        made += both.lead(2.0, 0.5 * DOWN, steps, max_cuts=6)
+        made += both.move_to(2.0, 0.5 * APPROACH, steps, max_cuts=6)
         off = float(np.abs(both.force).max() / np.abs(first).max())
         if mu:
             return made, off
-        made += both.lead(0.0, 0.5 * DOWN, steps, max_cuts=6)
-        return made, max(relative(both.force, first), off)
+        made += both.move_to(0.0, 0.5 * APPROACH, steps, max_cuts=6)
+        return made, max(relative_error(both.force, first), off)
 
     return solve
 
@@ -219,10 +227,10 @@ def lift_off(mu: float, **two: Any) -> Solve:
     """Press, slide and lift off; reference: zero force, and rigid-body displacements."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
-        both = Two(method, mu=mu, rounded=0.1, gap=1e-3, **two)
-        made = both.lead(0.0, DOWN, 2) + both.lead(0.2, DOWN, 4)
+        both = TwoBlocks(method, mu=mu, edge_gap=0.1, gap=1e-3, **two)
+        made = both.move_to(0.0, APPROACH, 2) + both.move_to(0.2, APPROACH, 4)
         first = np.abs(both.force).max()
-        made += both.lead(0.3, -0.2, 4)
+        made += both.move_to(0.3, -0.2, 4)
         upper = both.u.function_space.tabulate_dof_coordinates()[:, 1] > 1.0 + 1e-4
         rigid = np.where(upper[:, None], (0.3, 0.2), (0.0, 0.0))
         bent = np.abs(both.u.x.array.reshape(-1, 2) - rigid).max()
@@ -236,7 +244,7 @@ def lift_off(mu: float, **two: Any) -> Solve:
 
 def column(
     kappa: float,
-    share: float = 0.6,
+    stretch: float = 0.6,
     steps: int = 1,
     *,
     gap: float = 0.0,
@@ -252,26 +260,26 @@ def column(
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         moduli = two.get("moduli", (E, E))
-        ends = "smooth" if moduli[0] == moduli[1] else "confined"
+        ends = "frictionless" if moduli[0] == moduli[1] else "confined"
         options = {"n": (4, 4)} | two
-        both = Two(
+        both = TwoBlocks(
             method, kappa=kappa, mu=mu, widths=(1.0, 1.0), start=0.0, gap=gap, ends=ends, **options
         )
-        down = gap + 2.0 * (1.0 - share)
-        made = both.lead(0.0, down, steps, max_cuts=cuts)
+        down = gap + 2.0 * (1.0 - stretch)
+        made = both.move_to(0.0, down, steps, max_cuts=cuts)
         k_n = kappa * min(moduli) * options.get("rows", 4)
 
         def axial_stress(along: float) -> float:
-            return stress(along) if ends == "smooth" else nominal(along, 1.0)[0]
+            return stress(along) if ends == "frictionless" else nominal(along, 1.0)[0]
 
         def height(p: float, modulus: float) -> float:
             return bisect(lambda s: modulus / E * axial_stress(s) + p, 1e-3, 1.0)
 
         def lacking(p: float) -> float:
-            return p / k_n - sum(height(p, modulus) for modulus in moduli) + 2.0 * share
+            return p / k_n - sum(height(p, modulus) for modulus in moduli) + 2.0 * stretch
 
         wanted = bisect(lacking, 0.0, 1e3 * min(moduli))
-        return made, relative(both.contact.pressure, wanted)
+        return made, relative_error(both.contact.pressure, wanted)
 
     return solve
 
@@ -283,16 +291,16 @@ def against_solver(
     *,
     n: tuple[int, int] = (4, 3),
     moduli: tuple[float, float] = (E, E),
-    own: int = UPPER,
+    slave_tag: int = UPPER,
     steps: int = 2,
 ) -> Solve:
     """Press a block on another one, slide and rotate it; compare with the independent solver."""
-    soft = min(moduli) / moduli[0 if own == LOWER else 1]
+    soft = min(moduli) / moduli[0 if slave_tag == LOWER else 1]
     law: dict[str, Any] = {"kind": "coulomb" if mu else "frictionless"}
     law |= {"k_n": ["number", 4 * kappa * soft]}
     law |= {"k_t": ["number", 4 * kappa * soft], "friction": mu} if mu else {}
     upper, lower = {"body": 1, "side": "bottom"}, {"body": 0, "side": "top"}
-    here, there = (upper, lower) if own == UPPER else (lower, upper)
+    here, there = (upper, lower) if slave_tag == UPPER else (lower, upper)
     obstacle = {"kind": "body", "update_pairs": "never"} | there
     slab = {"origin": [0.0, 0.0], "size": [2.0, 1.0], "n": [n[0], 2], "E": moduli[0], "jitter": 0}
     block = {"origin": [0.6, 1.0], "size": [0.8, 0.5], "n": [n[1], 2], "E": moduli[1], "jitter": 0}
@@ -303,7 +311,9 @@ def against_solver(
     scene |= {"dirichlet": [[0, "bottom", [0, 1], "fixed"], [1, "top", [0, 1], "moved"]]}
     scene |= {"strain": 0.1, "load_ratio": 1.0, "bend": [0.0, 0.1]}
     scene |= {"stages": [still | {"side": 0.0, "turn": 0.0}, still | {"side": 0.1, "turn": 0.05}]}
-    return solved_twice(scene, sliding_scenes.SlidingSetup, sliding_reference.make_problem)
+    return compare_with_independent_solver(
+        scene, sliding_scenes.SlidingSetup, sliding_reference.make_problem
+    )
 
 
 def stiff_plate(ratio: float, mu: float, n: tuple[int, int] = (8, 4), kappa: float = 10.0) -> Solve:
@@ -321,7 +331,7 @@ def stiff_plate(ratio: float, mu: float, n: tuple[int, int] = (8, 4), kappa: flo
         problem, contact = block.problem(plate, law, method=method, **options)
         found = []
         for t in range(1, 5):
-            shift.value[:] = 0.05 * max(t - 2, 0), -0.5 * DOWN * min(t, 2)
+            shift.value[:] = 0.05 * max(t - 2, 0), -0.5 * APPROACH * min(t, 2)
             problem.solve()
             problem.commit()
             found.append(contact.resultants().force)
@@ -329,13 +339,13 @@ def stiff_plate(ratio: float, mu: float, n: tuple[int, int] = (8, 4), kappa: flo
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         two = {"widths": (1.0, 2.0), "start": -0.5, "n": n, "moduli": (E, ratio * E)}
-        both = Two(method, kappa=kappa, mu=mu, own=LOWER, **two)
+        both = TwoBlocks(method, kappa=kappa, mu=mu, slave_tag=LOWER, **two)
         made, found = [], []
         for t in range(1, 5):
-            made += both.lead(0.05 * max(t - 2, 0), 0.5 * DOWN * min(t, 2), 1)
+            made += both.move_to(0.05 * max(t - 2, 0), 0.5 * APPROACH * min(t, 2), 1)
             found.append(both.force)
         points = both.contact.quadrature.n_points // n[0]  # on one rank
-        return made, relative(found, rigid(method, points))
+        return made, relative_error(found, rigid(method, points))
 
     return solve
 
@@ -344,16 +354,16 @@ def close_gap(gap: float, by_force: bool = False, **two: Any) -> Solve:
     """Close a gap in one increment; reference: the force without the gap, or the load."""
 
     def force(method: str, gap: float) -> tuple[list[fc.Step], float]:
-        options = {"ends": "pushed"} if by_force else {"rounded": 0.1}
-        both = Two(method, gap=gap, **options, **two)
+        options = {"ends": "force"} if by_force else {"edge_gap": 0.1}
+        both = TwoBlocks(method, gap=gap, **options, **two)
         if not by_force:
-            return both.lead(0.0, gap + DOWN, 1, max_cuts=10), both.force[1]
-        made = list(fc.increments(both.problem, both.push, 0.0, 60.0, steps=1, max_cuts=10))
+            return both.move_to(0.0, gap + APPROACH, 1, max_cuts=10), both.force[1]
+        made = list(fc.increments(both.problem, both.pressure, 0.0, 60.0, steps=1, max_cuts=10))
         return made, both.force[1]
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         made, found = force(method, gap)
-        return made, relative(found, 60.0 if by_force else force(method, 0.0)[1])
+        return made, relative_error(found, 60.0 if by_force else force(method, 0.0)[1])
 
     return solve
 
@@ -362,11 +372,11 @@ def indent(steps: int, **two: Any) -> Solve:
     """Press without friction in any number of increments; reference: 16 increments."""
 
     def force(method: str, steps: int) -> tuple[list[fc.Step], Array]:
-        both = Two(method, rounded=0.1, **two)
-        return both.lead(0.0, 0.3, steps), both.force
+        both = TwoBlocks(method, edge_gap=0.1, **two)
+        return both.move_to(0.0, 0.3, steps), both.force
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         made, found = force(method, steps)
-        return made, relative(found, force(method, 16)[1])
+        return made, relative_error(found, force(method, 16)[1])
 
     return solve

@@ -25,13 +25,13 @@ E, NU = 1000.0, 0.3
 RADIUS, DEPTH = 0.8, 0.1
 
 
-def relative(found: Any, wanted: Any) -> float:
+def relative_error(found: Any, wanted: Any) -> float:
     """Return the largest difference relative to the largest expected value."""
     found, wanted = np.asarray(found), np.asarray(wanted)
     return float(np.abs(found - wanted).max() / np.abs(wanted).max())
 
 
-def _pressed(mu: float, method: str, **options: Any) -> tuple[DiscOnRubber, list[fc.Step]]:
+def _press_disc(mu: float, method: str, **options: Any) -> tuple[DiscOnRubber, list[fc.Step]]:
     """Press the disc into the block by `DEPTH`."""
     law = fc.Coulomb(mu, 1e4, 1e4) if mu else fc.Frictionless(1e4)
     solver = {"petsc_options": TIGHT_TOLERANCE, "method": method}
@@ -39,7 +39,7 @@ def _pressed(mu: float, method: str, **options: Any) -> tuple[DiscOnRubber, list
     return tool, [tool.solve_increment(0.0, -0.5 * DEPTH), tool.solve_increment(0.0, -DEPTH)]
 
 
-def _led(tool: DiscOnRubber, end: Any, steps: int) -> list[fc.Step]:
+def _move(tool: DiscOnRubber, end: Any, steps: int) -> list[fc.Step]:
     """Move the tool in equal increments to a lateral and a vertical displacement and an angle."""
     start = np.array([tool.shift.value[0], tool.shift.value[-1], float(tool.angle.value)])
 
@@ -60,24 +60,24 @@ def rotate_disc(angle: float, steps: int, mu: float = 0.3, **options: Any) -> So
     """
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
-        tool, made = _pressed(mu, method, **options)
-        made += _led(tool, (0.0, -DEPTH, angle), steps)
+        tool, made = _press_disc(mu, method, **options)
+        made += _move(tool, (0.0, -DEPTH, angle), steps)
         contact, centre = tool.contact, np.array([0.0, tool.scene.height + RADIUS - DEPTH])
         arm = np.linalg.norm(contact.points + contact.own_displacement() - centre, axis=1)
         wanted = np.sign(angle) * mu * (contact.measure * arm) @ contact.pressure
-        return made, relative(contact.moment(centre), wanted)
+        return made, relative_error(contact.moment(centre), wanted)
 
     return solve
 
 
-def rotated_together(steps: int, angle: float = 2 * np.pi) -> Solve:
+def rotate_together(steps: int, angle: float = 2 * np.pi) -> Solve:
     """Press and slide, then rotate body and disc about the origin; tractions rotate with them.
 
     The bottom of the body moves as a rigid body.
     """
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
-        tool, made = _pressed(0.3, method)
+        tool, made = _press_disc(0.3, method)
         made += [tool.solve_increment(0.05, -DEPTH)]
         before, place = tool.tractions(), tool.vector(0.05, -DEPTH)
         centre = tool.vector(0.0, tool.scene.height + RADIUS)
@@ -90,7 +90,7 @@ def rotated_together(steps: int, angle: float = 2 * np.pi) -> Solve:
             tool.angle.value = t * angle
 
         made += list(fc.increments(tool.problem, load, steps=steps))
-        return made, relative(tool.tractions(), before)
+        return made, relative_error(tool.tractions(), before)
 
     return solve
 
@@ -125,7 +125,7 @@ def slide_over_facets(n: int, steps: int, distance: float) -> Solve:
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         made, found = force(method, facets)
-        return made, relative(found, force(method, plane)[1])
+        return made, relative_error(found, force(method, plane)[1])
 
     return solve
 
@@ -156,7 +156,7 @@ def rotate_drum(n: int, steps: int, angle: float) -> Solve:
         made, found = force(
             method, lambda c, move: fc.RigidSurface(circle(n, RADIUS, c), ring(n), **move)
         )
-        return made, relative(found, force(method, lambda c, m: fc.Ball(c, RADIUS, **m))[1])
+        return made, relative_error(found, force(method, lambda c, m: fc.Ball(c, RADIUS, **m))[1])
 
     return solve
 
@@ -177,21 +177,21 @@ def slide_off(mu: float, steps: int, linear: bool = True) -> Solve:
         options = {"method": method, "petsc_options": TIGHT_TOLERANCE}
         problem, contact = scene.problem(plate, law, **options)
 
-        def lead(start: Any, end: Any, steps: int) -> list[fc.Step]:
+        def move(start: Any, end: Any, steps: int) -> list[fc.Step]:
             def load(t: float) -> None:
                 shift.value[:] = np.asarray(start) + t * (np.asarray(end) - np.asarray(start))
 
             return list(fc.increments(problem, load, steps=steps, max_cuts=6))
 
-        made = lead((0.0, 0.0), (0.0, -0.05), 1)
+        made = move((0.0, 0.0), (0.0, -0.05), 1)
         first = contact.resultants().force
-        made += lead((0.0, -0.05), (3.0, -0.05), steps)
+        made += move((0.0, -0.05), (3.0, -0.05), steps)
         off = contact.resultants().force
         if mu:
             return made, float(np.abs(off).max() / np.abs(first).max())
-        made += lead((3.0, -0.05), (0.0, -0.05), steps)
+        made += move((3.0, -0.05), (0.0, -0.05), steps)
         back = contact.resultants().force
-        return made, max(relative(back, first), float(np.abs(off).max()))
+        return made, max(relative_error(back, first), float(np.abs(off).max()))
 
     return solve
 
@@ -200,7 +200,7 @@ def slide_off(mu: float, steps: int, linear: bool = True) -> Solve:
 
 
 def column(
-    kappa: float, share: float = 0.6, steps: int = 1, *, gap: float = 0.0, mu: float = 0.0
+    kappa: float, stretch: float = 0.6, steps: int = 1, *, gap: float = 0.0, mu: float = 0.0
 ) -> Solve:
     """Compress a 1 x 1 column with free sides by a plane to a fraction of its height.
 
@@ -224,13 +224,13 @@ def column(
         problem = fc.ContactProblem(
             F, u, bcs=bcs, contacts=[contact], method=method, petsc_options=TIGHT_TOLERANCE
         )
-        down = gap + 1.0 - share
+        down = gap + 1.0 - stretch
 
         def load(t: float) -> None:
             shift.value[1] = -down * t
 
         made = list(fc.increments(problem, load, steps=steps))
-        wanted = bisect(lambda s: stress(s) + k_n * (s - share), share * 0.5, 1.0)
+        wanted = bisect(lambda s: stress(s) + k_n * (s - stretch), stretch * 0.5, 1.0)
         found = 1.0 + u.x.array.reshape(-1, 2)[:, 1].min()
         return made, abs(found - wanted) / (1.0 - wanted)
 
@@ -256,11 +256,11 @@ def stress(along: float) -> float:
     return nominal(along, across)[0]
 
 
-def bisect(rises: Any, low: float, high: float) -> float:
+def bisect(function: Any, low: float, high: float) -> float:
     """Return the zero of an increasing function."""
     for _ in range(100):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if rises(middle) < 0 else (low, middle)
+        low, high = (middle, high) if function(middle) < 0 else (low, middle)
     return 0.5 * (low + high)
 
 
@@ -287,10 +287,14 @@ def against_solver(
     scene |= {"dirichlet": [[0, "top", [0, 1], "fixed"]], "strain": 0.1, "load_ratio": 1.0}
     scene |= {"stages": stages} | change
 
-    return solved_twice(scene, finite_scenes.FiniteSetup, finite_reference.make_problem)
+    return compare_with_independent_solver(
+        scene, finite_scenes.FiniteSetup, finite_reference.make_problem
+    )
 
 
-def solved_twice(scene: dict[str, Any], setup_class: Any, make_problem: Any) -> Solve:
+def compare_with_independent_solver(
+    scene: dict[str, Any], setup_class: Any, make_problem: Any
+) -> Solve:
     """Solve the history of a random scene; compare the forces with the independent solver.
 
     Args:
@@ -305,26 +309,28 @@ def solved_twice(scene: dict[str, Any], setup_class: Any, make_problem: Any) -> 
         other, _, loads = make_problem(scene)
         old = [c.initial_state() for c in other.contacts]
         u, motion = np.zeros(other.body.nodes_x.size), np.zeros(0)
-        known, steps, worst = True, [], 0.0
+        is_solved, steps, largest_error = True, [], 0.0
         for stage, given in enumerate(scene["stages"]):
             for step in fc.increments(
                 problem, lambda t, s=stage: setup.apply(s, t), steps=given["steps"]
             ):
                 steps.append(step)
-                if not known:
+                if not is_solved:
                     continue
                 load = loads(stage, step.load)
                 try:
                     u, motion, old = other.solve(u, motion, load, old)
-                except (finite_reference.Failed, np.linalg.LinAlgError):
-                    known = False
+                except (finite_reference.NotSolved, np.linalg.LinAlgError):
+                    is_solved = False
                     continue
                 found = other.evaluate(u, motion, load, old)
                 pairs = zip(other.contacts, found, old, strict=True)
                 old = [c.next_state(f, o) for c, f, o in pairs]
                 force = other.contacts[0].weights @ found[0]["traction"]
-                worst = max(worst, relative(step.contacts["contact 0"].force, force))
-        return steps, worst if known else None
+                largest_error = max(
+                    largest_error, relative_error(step.contacts["contact 0"].force, force)
+                )
+        return steps, largest_error if is_solved else None
 
     return solve
 
@@ -354,7 +360,7 @@ def close_gap(gap: float, by_force: bool = False) -> Solve:
     def solve(method: str) -> tuple[list[fc.Step], float]:
         made, found = force(method, gap)
         # The mesh is not symmetric: a prescribed displacement has a lateral reaction.
-        return made, relative(found[1], -60.0 if by_force else force(method, 0.0)[1][1])
+        return made, relative_error(found[1], -60.0 if by_force else force(method, 0.0)[1][1])
 
     return solve
 
@@ -365,10 +371,10 @@ def indent(steps: int, down: float = 0.3, **options: Any) -> Solve:
     def force(method: str, steps: int) -> tuple[list[fc.Step], Array]:
         solver = {"petsc_options": TIGHT_TOLERANCE, "method": method}
         tool = DiscOnRubber(law=fc.Frictionless(1e4), radius=RADIUS, solver=solver, **options)
-        return _led(tool, (0.0, -down, 0.0), steps), tool.resultant()
+        return _move(tool, (0.0, -down, 0.0), steps), tool.resultant()
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         made, found = force(method, steps)
-        return made, relative(found, force(method, 16)[1])
+        return made, relative_error(found, force(method, 16)[1])
 
     return solve

@@ -46,17 +46,17 @@ class Block:
         size: Sequence[float] | None = None,
         modulus: float = E,
         nu: float = NU,
-        place: Callable[[Array], Array] | None = None,
+        node_map: Callable[[Array], Array] | None = None,
         cell: str = "quadrilateral",
     ) -> None:
-        """Create the mesh; ``place`` maps the nodes (2, n) of the unit square before scaling."""
+        """Create the mesh; ``node_map`` maps the nodes (2, n) of the unit square before scaling."""
         self.d = d = len(n)
         size = (1.0,) * d if size is None else size
         kind = dolfinx.mesh.CellType[cell if d == 2 or cell != "quadrilateral" else "hexahedron"]
         make = dolfinx.mesh.create_unit_square if d == 2 else dolfinx.mesh.create_unit_cube
         self.mesh = mesh = make(MPI.COMM_WORLD, *n, kind)
-        if place is not None:
-            mesh.geometry.x[:, :2] = place(mesh.geometry.x[:, :2].T).T
+        if node_map is not None:
+            mesh.geometry.x[:, :2] = node_map(mesh.geometry.x[:, :2].T).T
         sides = [(BOTTOM, d - 1, 0.0), (TOP, d - 1, 1.0), (LEFT, 0, 0.0)]
         sides += [(FRONT, 1, 0.0)] if d == 3 else []
         found = [
@@ -79,7 +79,7 @@ class Block:
         self.F = body.residual(v) - ufl.dot(self.traction, v) * ds(TOP)
         self.surface = fc.ContactSurface(mesh, self.tags, BOTTOM)
 
-    def hold(self, tag: int, component: int, value: Any = 0.0) -> fem.DirichletBC:
+    def fix(self, tag: int, component: int, value: Any = 0.0) -> fem.DirichletBC:
         """Return a Dirichlet condition for a component on a side."""
         if not isinstance(value, fem.Constant):
             value = fem.Constant(self.mesh, float(value))
@@ -89,12 +89,12 @@ class Block:
 
     def rollers(self) -> list[fem.DirichletBC]:
         """Return the symmetry conditions at x = 0 and, in 3D, y = 0."""
-        return [self.hold(LEFT, 0)] + ([self.hold(FRONT, 1)] if self.d == 3 else [])
+        return [self.fix(LEFT, 0)] + ([self.fix(FRONT, 1)] if self.d == 3 else [])
 
-    def moved(self, sideways: float, down: float) -> list[fem.DirichletBC]:
+    def prescribe_top(self, sideways: float, down: float) -> list[fem.DirichletBC]:
         """Return Dirichlet conditions that move the top along x and down."""
-        across = [self.hold(TOP, 1)] if self.d == 3 else []
-        return [self.hold(TOP, 0, sideways), *across, self.hold(TOP, self.d - 1, -down)]
+        across = [self.fix(TOP, 1)] if self.d == 3 else []
+        return [self.fix(TOP, 0, sideways), *across, self.fix(TOP, self.d - 1, -down)]
 
     def problem(
         self, law: Any, obstacle: Any, bcs: list[fem.DirichletBC], **options: Any
@@ -113,7 +113,7 @@ class Block:
         a = self.size[0]
         return fc.Ball([0.5 * a] * (self.d - 1) + [-2.0 * a], 2.0 * a)
 
-    def compressed(self, k_n: float, gap: float = 0.0, pressure: float = PRESSURE) -> float:
+    def compression_error(self, k_n: float, gap: float = 0.0, pressure: float = PRESSURE) -> float:
         """Return the relative error of the displacement under uniform pressure with free sides.
 
         σ = -p along the height; in plane strain u_y = -gap - p/k_n - (1 - ν²) p y/E and
@@ -151,17 +151,17 @@ def friction_law(mu: float, k_n: Any, k_t: Any = None) -> Any:
     return fc.Coulomb(mu, k_n, k_n if k_t is None else k_t) if mu else fc.Frictionless(k_n)
 
 
-def pressed(
+def press_block(
     kappa: float,
     mu: float = 0.0,
     *,
     gap: float = 0.0,
-    held: bool = True,
+    symmetric: bool = True,
     load: float = 1.0,
     history: int = 1,
     **block: Any,
 ) -> Solve:
-    """Press a block on a plane by a uniform load, with symmetry conditions if ``held``."""
+    """Press a block on a plane by a uniform load, with symmetry conditions if ``symmetric``."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         body = Block(**block)
@@ -169,7 +169,7 @@ def pressed(
         k_n = kappa * body.modulus / h
         # The load is proportional to the modulus, so that strains are equal in all units.
         p = PRESSURE * load * body.modulus / E
-        bcs = body.rollers() if held else []
+        bcs = body.rollers() if symmetric else []
         problem = body.problem(friction_law(mu, k_n), body.plane(gap), bcs, method=method)
 
         def apply(t: float) -> None:
@@ -177,14 +177,14 @@ def pressed(
 
         steps = list(fc.increments(problem, apply, steps=history))
         if mu == 0.0:
-            return steps, body.compressed(k_n, gap, p)
+            return steps, body.compression_error(k_n, gap, p)
         force = p * float(np.prod(body.size[:-1]))
         return steps, abs(steps[-1].contacts["contact"].normal_force / force - 1)
 
     return solve
 
 
-def compared(
+def compare_displacements(
     state: Callable[[str], tuple[list[fc.Step], Any]],
     reference: Callable[[], tuple[list[fc.Step], Any]],
 ) -> Solve:
@@ -204,46 +204,48 @@ def compared(
     return solve
 
 
-def on_disc(
+def press_on_disc(
     kappa: float,
     mu: float,
     *,
     ratio: float = 1.0,
-    down: float = 0.03,
-    sideways: float = 0.02,
-    against: str = "alternating",
-    known: float | None = None,
+    depth: float = 0.03,
+    lateral: float = 0.02,
+    reference_method: str = "alternating",
+    reference_stiffness: float | None = None,
     **block: Any,
 ) -> Solve:
     """Move the top of a block down and sideways on a disc or ball; compare u with another method.
 
-    The reference has the stiffness ``known``, by default the same.
+    The reference has the stiffness ``reference_stiffness``, by default the same.
     """
 
     def state(method: str, kappa: float = kappa, **options: Any) -> tuple[list[fc.Step], Block]:
         body = Block(**block)
         length = body.size[0]
-        bcs = body.moved(sideways * length, down * length)
+        bcs = body.prescribe_top(lateral * length, depth * length)
         law = friction_law(mu, fc.RelativeStiffness(kappa), fc.RelativeStiffness(kappa * ratio))
         problem = body.problem(law, body.ball(), bcs, method=method, **options)
         return [problem.solve()], body
 
-    return compared(state, lambda: state(against, known or kappa, fallback=False))
+    return compare_displacements(
+        state, lambda: state(reference_method, reference_stiffness or kappa, fallback=False)
+    )
 
 
 State = tuple[fc.Step, Array]
 
 
-def block_in_units(method: str, modulus: float, length: float, n: Sequence[int]) -> State:
+def solve_block_in_units(method: str, modulus: float, length: float, n: Sequence[int]) -> State:
     """Solve the block on the disc; return the step, and u divided by the length of the block."""
     body = Block(modulus=modulus, size=(length,) * len(n), n=n)
-    bcs = body.moved(0.02 * length, 0.03 * length)
+    bcs = body.prescribe_top(0.02 * length, 0.03 * length)
     problem = body.problem(fc.Coulomb(0.3), body.ball(), bcs, method=method)
     return problem.solve(), body.u.x.array / length
 
 
-def in_units(
-    modulus: float, length: float, n: Sequence[int] = (8, 8), scene: Any = block_in_units
+def solve_in_other_units(
+    modulus: float, length: float, n: Sequence[int] = (8, 8), scene: Any = solve_block_in_units
 ) -> Solve:
     """Solve in other units; the iterations must be equal, and the displacements are compared."""
 
@@ -272,7 +274,9 @@ def poisson(nu: float, degree: int, d: int = 2) -> Solve:
 @functools.lru_cache(maxsize=64)
 def _force(method: str, nu: float, degree: int, n: tuple[int, ...], cell: str) -> fc.Step:
     body = Block(degree, n=n, nu=nu, cell=cell)
-    problem = body.problem(fc.Frictionless(), body.ball(), body.moved(0.0, 0.03), method=method)
+    problem = body.problem(
+        fc.Frictionless(), body.ball(), body.prescribe_top(0.0, 0.03), method=method
+    )
     return problem.solve()
 
 
@@ -305,7 +309,7 @@ def cycle(path: list[tuple[float, float]], mu: float = 0.3) -> Solve:
     def solve(method: str) -> tuple[list[fc.Step], float]:
         body = Block()
         move = [fem.Constant(body.mesh, 0.0) for _ in range(2)]
-        bcs = [body.hold(TOP, i, c) for i, c in enumerate(move)]
+        bcs = [body.fix(TOP, i, c) for i, c in enumerate(move)]
         problem = body.problem(
             friction_law(mu, fc.RelativeStiffness(10)), body.plane(), bcs, method=method
         )
@@ -323,14 +327,14 @@ def cycle(path: list[tuple[float, float]], mu: float = 0.3) -> Solve:
     return solve
 
 
-def loaded(side: float, up: float, mu: float, bcs: str, n: Sequence[int] = (8, 8)) -> Solve:
+def load_block(side: float, up: float, mu: float, bcs: str, n: Sequence[int] = (8, 8)) -> Solve:
     """Load a block on a plane, and compare the contact force with the load."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         body = Block(n=n)
-        held = {"free": [], "sides": body.rollers()}[bcs]
+        conditions = {"free": [], "sides": body.rollers()}[bcs]
         problem = body.problem(
-            friction_law(mu, fc.RelativeStiffness(10)), body.plane(), held, method=method
+            friction_law(mu, fc.RelativeStiffness(10)), body.plane(), conditions, method=method
         )
         body.traction.value[0], body.traction.value[-1] = side, up
         step = problem.solve()
@@ -346,18 +350,18 @@ def loaded(side: float, up: float, mu: float, bcs: str, n: Sequence[int] = (8, 8
 def graded_to(ratio: float) -> Callable[[Array], Array]:
     """Return a map that grades cells along x by ``ratio`` from the centre of Γc to its ends."""
 
-    def place(x: Array) -> Array:
+    def map_nodes(x: Array) -> Array:
         s = 2 * x[0] - 1
         growth = np.log(ratio)
         moved = np.sign(s) * np.expm1(growth * np.abs(s)) / np.expm1(growth)
         return np.vstack([0.5 + 0.5 * moved, x[1]])
 
-    return place
+    return map_nodes
 
 
 # ---- one block on another ----------------------------------------------------------------------
 
-APART = 0.25  # distance of the blocks during meshing, to distinguish their sides
+MESHING_GAP = 0.25  # distance of the blocks during meshing, to distinguish their sides
 
 
 class Pair:
@@ -383,19 +387,19 @@ class Pair:
         self.moduli, self.length, self.gap = (modulus, contrast * modulus), length, gap * length
         lines = [
             [np.linspace(0, 1, m + 1), low + np.linspace(0, 0.5, m // 2 + 1)]
-            for m, low in zip(n, (0.0, 0.5 + APART), strict=True)
+            for m, low in zip(n, (0.0, 0.5 + MESHING_GAP), strict=True)
         ]
         sides = {
             BOTTOM: at_coordinate(1, 0.0),
-            TOP: at_coordinate(1, 1.0 + APART),
+            TOP: at_coordinate(1, 1.0 + MESHING_GAP),
             LEFT: at_coordinate(0, 0.0),
             FRONT: at_coordinate(1, 0.5),
-            OPPOSITE: at_coordinate(1, 0.5 + APART),
+            OPPOSITE: at_coordinate(1, 0.5 + MESHING_GAP),
         }
 
         def bend(x: Array) -> Array:
-            upper = x[:, 1] > 0.5 + 0.5 * APART
-            down = np.where(upper, gap - APART, 0.0)
+            upper = x[:, 1] > 0.5 + 0.5 * MESHING_GAP
+            down = np.where(upper, gap - MESHING_GAP, 0.0)
             return length * np.column_stack([x[:, 0], x[:, 1] + down])
 
         made = boxes(lines, sides, bend=bend, partitioner=partitioner)
@@ -444,7 +448,7 @@ class Pair:
         self.body.prescribe(TOP, 0, value=sideways * self.length)
         self.body.prescribe(TOP, 1, value=-down * self.length)
 
-    def compressed(self, k_n: float, pressure: float) -> float:
+    def compression_error(self, k_n: float, pressure: float) -> float:
         """Return the relative error of the displacement under uniform pressure, as in `Block`."""
         exact = fem.Function(self.u.function_space)
         half = 0.5 * self.length
@@ -471,7 +475,7 @@ def flat_pair(kappa: float, **pair: Any) -> Solve:
         k_n = kappa * min(both.moduli) * 6 / both.length
         pressure = both.press()
         step = both.problem(fc.Frictionless(k_n), method=method).solve()
-        return [step], both.compressed(k_n, pressure)
+        return [step], both.compression_error(k_n, pressure)
 
     return solve
 
@@ -486,10 +490,10 @@ def rounded_pair(kappa: float, mu: float, **pair: Any) -> Solve:
         problem = both.problem(friction_law(mu, k), curved=True, method=method, **options)
         return [problem.solve()], both
 
-    return compared(state, lambda: state("alternating", fallback=False))
+    return compare_displacements(state, lambda: state("alternating", fallback=False))
 
 
-def pair_in_units(method: str, modulus: float, length: float, _: Any) -> State:
+def solve_pair_in_units(method: str, modulus: float, length: float, _: Any) -> State:
     """Solve the rounded blocks; return the step, and u divided by the length."""
     both = Pair(modulus=modulus, length=length)
     both.drag()
@@ -513,12 +517,12 @@ def hertz(kappa: float, *, enforcement: str = "penalty") -> tuple[Solve, float]:
     peak, cells, far = star * a / (2 * radius), 10, 40.0
     h = a / cells
     k_n = kappa * E / h
-    share = star / (k_n * a)
-    if share > 1 and enforcement == "penalty":
+    penalty_error = star / (k_n * a)
+    if penalty_error > 1 and enforcement == "penalty":
         a = (1.5 * force * radius / k_n) ** (1 / 3)
-        peak, share = k_n * a**2 / (2 * radius), k_n * a / star
+        peak, penalty_error = k_n * a**2 / (2 * radius), k_n * a / star
     if enforcement != "penalty":
-        share = 0.0
+        penalty_error = 0.0
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         x = graded(0.15, 15, far * 0.1, 1.3)
@@ -540,13 +544,13 @@ def hertz(kappa: float, *, enforcement: str = "penalty") -> tuple[Solve, float]:
         step = problem.solve()
         return [step], abs(step.contacts["contact"].max_pressure / peak - 1)
 
-    return solve, share
+    return solve, penalty_error
 
 
 # ---- several ranks -------------------------------------------------------------------------------
 
 
-def lower_block_apart(comm: MPI.Comm, n_parts: int, cell_types: Any, cells: Any) -> Any:
+def partition_blocks(comm: MPI.Comm, n_parts: int, cell_types: Any, cells: Any) -> Any:
     """Partition `Pair`: the lower block on the last rank, the upper one on the others."""
     n_cells = cells[0].size // 4
     n_lower = 6 * 3
@@ -556,10 +560,10 @@ def lower_block_apart(comm: MPI.Comm, n_parts: int, cell_types: Any, cells: Any)
     )
 
 
-def ranked(
-    kind: str, kappa: float, mu: float, method: str, *, apart: bool = True
+def solve_on_ranks(
+    kind: str, kappa: float, mu: float, method: str, *, separate_ranks: bool = True
 ) -> tuple[fc.Step, Array, list[int]]:
-    """Solve two blocks, or one block on a disc, with all of Γc on the last rank if ``apart``.
+    """Solve two blocks, or one block on a disc, with Γc on the last rank if ``separate_ranks``.
 
     Collective.
 
@@ -568,7 +572,9 @@ def ranked(
         of facets of Γc on every rank.
     """
     comm = MPI.COMM_WORLD
-    both = Pair(gap=1e-3, partitioner=lower_block_apart if apart and comm.size > 1 else None)
+    both = Pair(
+        gap=1e-3, partitioner=partition_blocks if separate_ranks and comm.size > 1 else None
+    )
     both.drag()
     law = friction_law(mu, kappa * 6 * E)
     if kind == "two bodies":
@@ -592,8 +598,8 @@ def ranked(
     return step, rows[order], comm.allgather(len(both.surface.facets))
 
 
-def on_one_rank(ranks: int, kind: str, kappa: float, mu: float) -> Solve:
-    """Run `ranked` on several ranks, and compare the displacements with those on one rank."""
+def compare_with_one_rank(ranks: int, kind: str, kappa: float, mu: float) -> Solve:
+    """Run `solve_on_ranks` on several ranks; compare the displacements with those on one rank."""
 
     def solve(method: str) -> tuple[list[fc.Step], float]:
         with tempfile.TemporaryDirectory() as folder:
@@ -607,7 +613,7 @@ def on_one_rank(ranks: int, kind: str, kappa: float, mu: float) -> Solve:
             step, rows, n_facets = pickle.loads(path.read_bytes())
         if np.count_nonzero(n_facets) != 1:
             raise RuntimeError(f"Γc is not on one rank alone: {n_facets} facets")
-        _, alone, _ = ranked(kind, kappa, mu, method)
+        _, alone, _ = solve_on_ranks(kind, kappa, mu, method)
         return [step], float(np.abs(rows - alone).max() / np.abs(alone[:, 2:]).max())
 
     return solve
@@ -615,6 +621,6 @@ def on_one_rank(ranks: int, kind: str, kappa: float, mu: float) -> Solve:
 
 if __name__ == "__main__":
     kind, kappa, mu, method, path = sys.argv[1:]
-    found = ranked(kind, float(kappa), float(mu), method)
+    found = solve_on_ranks(kind, float(kappa), float(mu), method)
     if MPI.COMM_WORLD.rank == 0:
         Path(path).write_bytes(pickle.dumps(found))

@@ -33,19 +33,19 @@ from verification import report
 from verification.extreme_scenes import (
     E,
     Solve,
+    compare_with_one_rank,
     cycle,
     flat_pair,
     graded_to,
     hertz,
-    in_units,
-    loaded,
-    on_disc,
-    on_one_rank,
-    pair_in_units,
+    load_block,
     poisson,
-    pressed,
+    press_block,
+    press_on_disc,
     proportional,
     rounded_pair,
+    solve_in_other_units,
+    solve_pair_in_units,
 )
 
 PAGE = ROOT / "docs" / "extremes.md"
@@ -147,24 +147,28 @@ class Trial:
             )
 
 
-def trials() -> Iterator[Trial]:
+def all_trials() -> Iterator[Trial]:
     """Yield all problems."""
     patch = "uniform compression (exact)"
     other = "method `alternating`"
     stiffnesses = [10.0**i for i in range(-3, 9)]
     for k in stiffnesses:
-        yield Trial("block on a plane, k_n h/E", f"{k:.0e}", pressed(k), patch)
+        yield Trial("block on a plane, k_n h/E", f"{k:.0e}", press_block(k), patch)
     for mu in (0.0, 0.3):
         for k in stiffnesses:
             name = f"block on a disc, μ = {mu:g}, k_n h/E"
-            yield Trial(name, f"{k:.0e}", on_disc(k, mu), other, 1e-5)
+            yield Trial(name, f"{k:.0e}", press_on_disc(k, mu), other, 1e-5)
     for ratio in [10.0**i for i in range(-6, 4)]:
         case = f"{ratio:.0e}"
         yield Trial(
-            "block on a disc, μ = 0.3, k_t/k_n", case, on_disc(10, 0.3, ratio=ratio), other, 1e-5
+            "block on a disc, μ = 0.3, k_t/k_n",
+            case,
+            press_on_disc(10, 0.3, ratio=ratio),
+            other,
+            1e-5,
         )
     for mu in (0.0, 0.01, 0.1, 0.5, 1.0, 2.0, 5.0, 10.0):
-        yield Trial("block on a disc, μ", f"{mu:g}", on_disc(10, mu), other, 1e-5)
+        yield Trial("block on a disc, μ", f"{mu:g}", press_on_disc(10, mu), other, 1e-5)
     fine = "force, P3, half the mesh size"
     for degree in (1, 2, 3):
         for nu in (0.0, 0.3, 0.45, 0.49, 0.499, 0.4999):
@@ -176,14 +180,22 @@ def trials() -> Iterator[Trial]:
     same = "N and mm, equal iterations"
     for modulus in (1e-6, 1e-3, 1.0, 1e6, 1e9, 1e12, 1e15):
         yield Trial(
-            "block on a disc, unit of E", f"{modulus:.0e}", in_units(modulus, 1.0), same, 1e-9
+            "block on a disc, unit of E",
+            f"{modulus:.0e}",
+            solve_in_other_units(modulus, 1.0),
+            same,
+            1e-9,
         )
     for length in (1e-9, 1e-6, 1e-3, 1e3, 1e6):
         yield Trial(
-            "block on a disc, unit of length", f"{length:.0e}", in_units(E, length), same, 1e-9
+            "block on a disc, unit of length",
+            f"{length:.0e}",
+            solve_in_other_units(E, length),
+            same,
+            1e-9,
         )
     for gap in (0.0, 1e-9, 1e-3, 1.0, 10.0, 1000.0):
-        yield Trial("block on a plane, gap / height", f"{gap:g}", pressed(10, gap=gap), patch)
+        yield Trial("block on a plane, gap / height", f"{gap:g}", press_block(10, gap=gap), patch)
     for steps in (1, 10, 100, 1000):
         yield Trial(
             "block on a plane, number of increments",
@@ -208,11 +220,11 @@ def trials() -> Iterator[Trial]:
     )
     for load in (0.0, 1e-6, 1e3):
         yield Trial(
-            "block on a plane, load path", f"load × {load:g}", pressed(10, load=load), patch
+            "block on a plane, load path", f"load × {load:g}", press_block(10, load=load), patch
         )
-    yield Trial("block on a plane, load path", "tensile load", loaded(0.0, 1.0, 0.0, "sides"))
+    yield Trial("block on a plane, load path", "tensile load", load_block(0.0, 1.0, 0.0, "sides"))
     for down_by in (1e-12, 1e-9, 1e-6, 1e-4, 1e-3):
-        first = on_disc(10, 0.3, down=down_by, sideways=0.0)
+        first = press_on_disc(10, 0.3, depth=down_by, lateral=0.0)
         yield Trial(
             "block on a disc, first contact of one node, approach",
             f"{down_by:g}",
@@ -224,49 +236,52 @@ def trials() -> Iterator[Trial]:
     yield Trial(
         "block without Dirichlet conditions",
         "constrained by friction",
-        loaded(0.1, -1.0, 0.3, "free"),
+        load_block(0.1, -1.0, 0.3, "free"),
         force,
     )
     yield Trial(
         "block without Dirichlet conditions",
         "load above the friction limit",
-        loaded(0.5, -1.0, 0.3, "free"),
+        load_block(0.5, -1.0, 0.3, "free"),
     )
     yield Trial(
-        "block without Dirichlet conditions", "frictionless", loaded(0.0, -1.0, 0.0, "free")
+        "block without Dirichlet conditions", "frictionless", load_block(0.0, -1.0, 0.0, "free")
     )
     for ratio in (1e1, 1e2, 1e4):
-        meshes = {"place": graded_to(ratio), "n": (32, 8)}
-        yield Trial("ratio of cell sizes", f"{ratio:g}, plane", pressed(10, **meshes), patch)
+        meshes = {"node_map": graded_to(ratio), "n": (32, 8)}
+        yield Trial("ratio of cell sizes", f"{ratio:g}, plane", press_block(10, **meshes), patch)
         yield Trial(
-            "ratio of cell sizes", f"{ratio:g}, disc", on_disc(10, 0.3, **meshes), other, 1e-5
+            "ratio of cell sizes", f"{ratio:g}, disc", press_on_disc(10, 0.3, **meshes), other, 1e-5
         )
     for aspect in (1e1, 1e2, 1e3):
         wide = {"size": (aspect, 1.0)}
         yield Trial(
-            "block on a plane, aspect ratio of cells", f"{aspect:g}", pressed(10, **wide), patch
+            "block on a plane, aspect ratio of cells", f"{aspect:g}", press_block(10, **wide), patch
         )
         flat = {"size": (1.0, 1 / aspect)}
         yield Trial(
-            "block on a plane, aspect ratio of cells", f"1/{aspect:g}", pressed(10, **flat), patch
+            "block on a plane, aspect ratio of cells",
+            f"1/{aspect:g}",
+            press_block(10, **flat),
+            patch,
         )
     for degree in (1, 2, 3):
         case = f"P{degree}"
-        yield Trial("polynomial degree", f"{case}, plane", pressed(10, degree=degree), patch)
+        yield Trial("polynomial degree", f"{case}, plane", press_block(10, degree=degree), patch)
         yield Trial(
-            "polynomial degree", f"{case}, disc", on_disc(10, 0.3, degree=degree), other, 1e-5
+            "polynomial degree", f"{case}, disc", press_on_disc(10, 0.3, degree=degree), other, 1e-5
         )
-    yield Trial("all points of Γc closed", "μ = 0.3", pressed(10, 0.3), "applied load")
+    yield Trial("all points of Γc closed", "μ = 0.3", press_block(10, 0.3), "applied load")
     yield Trial("all points of Γc open", "lifted block", cycle([up, up]), back)
-    yield from in_space()
-    yield from two_bodies()
-    yield from against_hertz()
-    yield from one_rank_alone()
-    yield from finite_kinematics()
-    yield from finite_bodies()
+    yield from trials_3d()
+    yield from two_body_trials()
+    yield from hertz_trials()
+    yield from one_rank_trials()
+    yield from finite_kinematics_trials()
+    yield from finite_body_trials()
 
 
-def one_rank_alone() -> Iterator[Trial]:
+def one_rank_trials() -> Iterator[Trial]:
     """Yield problems with Γc on one of several ranks, in separate processes."""
     for ranks in (2, 3):
         for kind, k, mu in (("disc", 10.0, 0.3), ("two bodies", 1e5, 0.0)):
@@ -274,19 +289,19 @@ def one_rank_alone() -> Iterator[Trial]:
             yield Trial(
                 "Γc on one rank only",
                 case,
-                on_one_rank(ranks, kind, k, mu),
+                compare_with_one_rank(ranks, kind, k, mu),
                 "one rank",
                 1e-5,
                 METHODS if kind == "disc" else ("newton",),  # L-BFGS needs hundreds of iterations
             )
 
 
-def in_space() -> Iterator[Trial]:
+def trials_3d() -> Iterator[Trial]:
     """Yield blocks of hexahedra on a plane and on a ball."""
     few, some = (2, 2, 2), (4, 4, 4)
     for k in (1e-3, 1.0, 1e3, 1e6, 1e8):
         name = "3D, block on a plane, k_n h/E"
-        yield Trial(name, f"{k:.0e}", pressed(k, n=few), "uniform compression (exact)")
+        yield Trial(name, f"{k:.0e}", press_block(k, n=few), "uniform compression (exact)")
     other = "method `alternating`"
     for mu in (0.0, 0.3):
         for k in (1e-3, 1e-1, 1e1, 1e2, 1e3, 1e4, 1e6, 1e8):
@@ -294,9 +309,15 @@ def in_space() -> Iterator[Trial]:
             # `alternating` fails for stiffer friction; the solution changes by about 1e-6.
             limited = 1e6 if mu and k > 1e6 else k
             reference = other if limited == k else f"{other}, k_n h/E = {limited:.0e}"
-            yield Trial(name, f"{k:.0e}", on_disc(k, mu, known=limited, n=some), reference, 1e-5)
+            yield Trial(
+                name,
+                f"{k:.0e}",
+                press_on_disc(k, mu, reference_stiffness=limited, n=some),
+                reference,
+                1e-5,
+            )
     for mu in (0.01, 1.0, 10.0):
-        yield Trial("3D, block on a ball, μ", f"{mu:g}", on_disc(10, mu, n=some), other, 1e-5)
+        yield Trial("3D, block on a ball, μ", f"{mu:g}", press_on_disc(10, mu, n=some), other, 1e-5)
     for nu, degree in ((0.4999, 1), (0.3, 2), (0.499, 2), (0.4999, 2)):
         fine = "force, degree 2, half the mesh size"
         tolerance = np.inf if degree == 1 else 0.05
@@ -304,21 +325,25 @@ def in_space() -> Iterator[Trial]:
         yield Trial(name, case, poisson(nu, degree, 3), fine, tolerance)
     same = "N and mm, equal iterations"
     for modulus in (1e-6, 1e15):
-        yield Trial("3D, units", f"E {modulus:.0e}", in_units(modulus, 1.0, some), same, 1e-9)
+        yield Trial(
+            "3D, units", f"E {modulus:.0e}", solve_in_other_units(modulus, 1.0, some), same, 1e-9
+        )
     for length in (1e-9, 1e6):
-        yield Trial("3D, units", f"length {length:.0e}", in_units(E, length, some), same, 1e-9)
-    free = loaded(0.1, -1.0, 0.3, "free", some)
+        yield Trial(
+            "3D, units", f"length {length:.0e}", solve_in_other_units(E, length, some), same, 1e-9
+        )
+    free = load_block(0.1, -1.0, 0.3, "free", some)
     yield Trial(
         "3D, block without Dirichlet conditions", "constrained by friction", free, "applied load"
     )
     yield Trial(
         "3D, block without Dirichlet conditions",
         "load above the friction limit",
-        loaded(0.5, -1.0, 0.3, "free", some),
+        load_block(0.5, -1.0, 0.3, "free", some),
     )
 
 
-def two_bodies() -> Iterator[Trial]:
+def two_body_trials() -> Iterator[Trial]:
     """Yield problems of two linear elastic blocks."""
     exact, other = "uniform compression (exact)", "method `alternating`"
     for k in (1e-3, 1.0, 1e3, 1e6, 1e8):
@@ -338,11 +363,11 @@ def two_bodies() -> Iterator[Trial]:
     same = "N and mm, equal iterations"
     for modulus, length in ((1e-6, 1.0), (1e15, 1.0), (E, 1e-9), (E, 1e6)):
         case = f"E {modulus:.0e}" if modulus != E else f"length {length:.0e}"
-        units = in_units(modulus, length, scene=pair_in_units)
+        units = solve_in_other_units(modulus, length, scene=solve_pair_in_units)
         yield Trial("two bodies, units", case, units, same, 1e-9)
 
 
-def against_hertz() -> Iterator[Trial]:
+def hertz_trials() -> Iterator[Trial]:
     """Yield a rigid cylinder on a half-plane; tolerance: 1 % for the mesh, plus penalty error."""
     name = "rigid cylinder on a half-plane, peak pressure, k_n h/E"
     for k in [10.0**i for i in range(-3, 9)]:
@@ -353,7 +378,7 @@ def against_hertz() -> Iterator[Trial]:
     yield Trial(name, "1e+01, augmented", solve, "Hertz, 1 %", 0.01)
 
 
-def finite_kinematics() -> Iterator[Trial]:
+def finite_kinematics_trials() -> Iterator[Trial]:
     """Yield linear and hyperelastic bodies on moving and rotating obstacles, finite kinematics."""
     alone = ("newton",)
     moment, again = "friction moment at full slip (exact)", "tractions before the rotation"
@@ -371,7 +396,7 @@ def finite_kinematics() -> Iterator[Trial]:
     yield Trial(name, "360° in 12, linear body", linear, moment, 1e-9)
     for steps in (4, 12, 36):
         case = f"body and disc together, 360° in {steps}"
-        yield Trial(name, case, finite.rotated_together(steps), again, 1e-7, alone)
+        yield Trial(name, case, finite.rotate_together(steps), again, 1e-7, alone)
     name = "finite kinematics, sliding over facets"
     for n, steps in ((1000, 10), (4000, 40)):
         solve, slow = finite.slide_over_facets(2 * n, steps, 6.0), n > 1000
@@ -439,16 +464,16 @@ _DISSIMILAR = {
 }
 
 
-def finite_bodies() -> Iterator[Trial]:
+def finite_body_trials() -> Iterator[Trial]:
     """Yield finite sliding of two bodies of equal and of very different mesh and modulus."""
     alone, start = ("newton",), "two bodies, finite kinematics, "
     name, again = start + "both rotated by 360°, increments", "tractions before the rotation"
     for steps in (4, 12, 36):
-        yield Trial(name, f"{steps}, μ = 0.3", bodies.rotated_together(steps), again, 1e-6, alone)
+        yield Trial(name, f"{steps}, μ = 0.3", bodies.rotate_together(steps), again, 1e-6, alone)
     for mu, (case, options) in (
         (m, u) for m in (0.3, 1.0) for u in list(_DISSIMILAR.items())[m < 1 :]
     ):
-        solve = bodies.rotated_together(36, mu, **options)
+        solve = bodies.rotate_together(36, mu, **options)
         yield Trial(name, f"36, μ = {mu:g}, {case}", solve, again, 1e-6, alone)
     name, before = start + "sliding over facets", "force several facets before"
     for n, steps, mu, wide in (
@@ -474,11 +499,11 @@ def finite_bodies() -> Iterator[Trial]:
         yield Trial(name, f"{mu:g}", bodies.lift_off(mu), nothing, 1e-9, alone)
     for case, options in list(_DISSIMILAR.items())[1:]:
         yield Trial(name, f"0.3, {case}", bodies.lift_off(0.3, **options), nothing, 1e-9, alone)
-    yield from _columns_of_two(start, alone)
-    yield from _against_others(start, alone)
+    yield from _column_trials(start, alone)
+    yield from _comparison_trials(start, alone)
 
 
-def _columns_of_two(start: str, alone: tuple[str, ...]) -> Iterator[Trial]:
+def _column_trials(start: str, alone: tuple[str, ...]) -> Iterator[Trial]:
     """Yield uniform compression of two columns."""
     name, exact = start + "rubber columns compressed to 60 %", "uniform stretch (exact)"
     fine, coarse = {"n": (1, 20)}, {"n": (20, 1)}
@@ -506,7 +531,7 @@ def _columns_of_two(start: str, alone: tuple[str, ...]) -> Iterator[Trial]:
     yield Trial(name, "gap of 1000 heights, halved up to 14 times", away, exact, 1e-6, alone)
 
 
-def _against_others(start: str, alone: tuple[str, ...]) -> Iterator[Trial]:
+def _comparison_trials(start: str, alone: tuple[str, ...]) -> Iterator[Trial]:
     """Yield comparisons with the independent solver, a rigid plane, and other increments."""
     second = "independent solver"
     for mu in (0.0, 0.3, 1.0):
@@ -519,9 +544,9 @@ def _against_others(start: str, alone: tuple[str, ...]) -> Iterator[Trial]:
             yield Trial(name, f"{k:.0e}, linear bodies", solve, second, 1e-5, alone)
         for case, options in (
             ("Γc 20 times finer", {"n": (1, 8)}),
-            ("lower body slave, 20 times finer", {"n": (50, 1), "own": bodies.LOWER}),
+            ("lower body slave, 20 times finer", {"n": (50, 1), "slave_tag": bodies.LOWER}),
             ("Γc 20 times coarser", {"n": (50, 1)}),
-            ("lower body slave, 20 times coarser", {"n": (1, 8), "own": bodies.LOWER}),
+            ("lower body slave, 20 times coarser", {"n": (1, 8), "slave_tag": bodies.LOWER}),
             ("lower body 1e3 times stiffer", {"moduli": (1e3 * E, E)}),
             ("lower body 1e6 times stiffer", {"moduli": (1e6 * E, E)}),
             ("upper body 1e6 times stiffer", {"moduli": (E, 1e6 * E)}),
@@ -548,7 +573,7 @@ def _against_others(start: str, alone: tuple[str, ...]) -> Iterator[Trial]:
     for gap in (0.01, 1.0, 1000.0):
         near = "force without the gap"
         yield Trial(name, f"{gap:g}", bodies.close_gap(gap), near, 1e-7, alone)
-        below = bodies.close_gap(gap, own=bodies.LOWER)
+        below = bodies.close_gap(gap, slave_tag=bodies.LOWER)
         yield Trial(name, f"{gap:g}, lower body slave", below, near, 1e-7, alone)
         pushed = bodies.close_gap(gap, True)
         yield Trial(name, f"{gap:g}, prescribed force", pushed, "applied load", 1e-7, alone)
@@ -709,7 +734,7 @@ def draw_stiffness(path: Path, rows: list[Row]) -> None:
             axes.legend(fontsize=7)
 
 
-def known(path: Path) -> dict[tuple[str, str, str], Row]:
+def read_stored_rows(path: Path) -> dict[tuple[str, str, str], Row]:
     """Read stored rows, by group, case and method."""
     rows = [
         Row(
@@ -726,16 +751,22 @@ def main() -> int:
     """Solve the problems and write the results; return 0 if no run has failed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="+", metavar="WORD", help="groups with one of these words")
-    parser.add_argument("--output", type=Path, help="page to write, with a CSV file beside it")
+    parser.add_argument(
+        "--output", type=Path, help="page to write; the CSV file is written to the same directory"
+    )
     parser.add_argument("--page", action="store_true", help="only write the page of stored runs")
     arguments = parser.parse_args()
     words = [word.lower() for word in arguments.only or [""]]
     path = arguments.output or PAGE
     rows: list[Row] = []
     if arguments.page:
-        rows += known(path.with_suffix(".csv")).values()
-    stored = known(path.with_suffix(".csv")) if arguments.only and not arguments.output else {}
-    for trial in trials() if not arguments.page else ():
+        rows += read_stored_rows(path.with_suffix(".csv")).values()
+    stored = (
+        read_stored_rows(path.with_suffix(".csv"))
+        if arguments.only and not arguments.output
+        else {}
+    )
+    for trial in all_trials() if not arguments.page else ():
         if not any(word in trial.group.lower() for word in words):
             keys = [(trial.group, trial.case, method) for method in trial.methods]
             rows += [stored[key] for key in keys if key in stored]
@@ -743,7 +774,7 @@ def main() -> int:
         for row in trial.run():
             rows.append(row)
             print(
-                f"{'WRONG ' * row.has_failed}{row.group}; {row.case}; {row.method}: "
+                f"{'FAILED ' * row.has_failed}{row.group}; {row.case}; {row.method}: "
                 f"{row.outcome[:150]}; {row.attempts}; error {row.error:.1e}; {row.seconds:.1f} s",
                 flush=True,
             )

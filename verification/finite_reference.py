@@ -23,14 +23,14 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
-from verification import finite_scenes, fuzz_judge, fuzz_reference
+from verification import finite_scenes, fuzz_comparison, fuzz_reference
 from verification import reference_solver as reference
 from verification.reference_geometry import Body
-from verification.reference_solver import Failed
+from verification.reference_solver import NotSolved
 
 __all__ = [
+    "FiniteComparison",
     "FiniteContact",
-    "FiniteJudge",
     "FiniteProblem",
     "make_bulk",
     "make_loads",
@@ -47,9 +47,9 @@ GapFunction = Callable[[Array], tuple[Array, Array]]
 _DIFFERENCE = 1e-8
 # Numbers of parts into which an increment is divided, in the order of attempts; factors of the
 # contact stiffness in its continuation; and largest number of augmentations.
-_PARTS = (4, 32)
-_SOFTER = 10.0 ** np.arange(-5, 0.1, 0.5)
-_ROUNDS = 400
+_SUBDIVISIONS = (4, 32)
+_STIFFNESS_FACTORS = 10.0 ** np.arange(-5, 0.1, 0.5)
+_MAX_AUGMENTATIONS = 400
 
 
 # ---- shapes --------------------------------------------------------------------------------------
@@ -63,12 +63,12 @@ def make_shape(scene: dict[str, Any], contact: dict[str, Any]) -> GapFunction:
         normal = where["normal"]
         return lambda x: ((x - where["point"]) @ normal, np.tile(-normal, (len(x), 1)))
     if kind.startswith(("ball", "cylinder")):
-        keep = np.eye(d)
+        projector = np.eye(d)
         if kind.startswith("cylinder") and d == 3:
             axis = np.array(given.get("axis", (0.0, 1.0, 0.0)))
-            keep -= np.outer(axis, axis) / (axis @ axis)
+            projector -= np.outer(axis, axis) / (axis @ axis)
         sign = -1.0 if kind.endswith("inside") else 1.0
-        return lambda x: _radial_gap((x - where["center"]) @ keep, where["radius"], sign)
+        return lambda x: _radial_gap((x - where["center"]) @ projector, where["radius"], sign)
     if kind in ("capsule", "rod"):
         return lambda x: fuzz_reference.capsule_gap_at(x, where)
     if kind == "torus":
@@ -88,14 +88,14 @@ def make_shape(scene: dict[str, Any], contact: dict[str, Any]) -> GapFunction:
         flat = (points - where["center"])[:, [0, 2]]
         loop = _spline_gap(np.concatenate([flat, flat[-2:0:-1] * [-1.0, 1.0]]))
 
-        def rotation(x: Array) -> tuple[Array, Array]:
+        def revolved(x: Array) -> tuple[Array, Array]:
             arm = x - where["center"]
             out = np.hypot(arm[:, 0], arm[:, 1])
             distance, normal = loop(np.column_stack([out, arm[:, 2]]))
             direction = arm[:, :2] / out[:, None]
             return distance, np.column_stack([normal[:, :1] * direction, normal[:, 1]])
 
-        return rotation
+        return revolved
     loop = _spline_gap(points[:, [0, -1]])
     if d == 2:
         return loop
@@ -162,12 +162,12 @@ def _polyhedron_gap(corners: Array) -> GapFunction:
             if d == 3:
                 side = np.cross(direction[None], closest - a)
                 below &= np.sum(side * out, axis=2) >= 0
-            share = np.sum((x[:, None] - a) * direction, axis=2) / np.sum(
+            fraction = np.sum((x[:, None] - a) * direction, axis=2) / np.sum(
                 direction * direction, axis=1
             )
             if d == 2:
-                below &= (share >= 0) & (share <= 1)
-            near = a + np.clip(share, 0, 1)[:, :, None] * direction
+                below &= (fraction >= 0) & (fraction <= 1)
+            near = a + np.clip(fraction, 0, 1)[:, :, None] * direction
             arms.append(x[:, None] - near)
         arms = np.concatenate(arms, axis=1)
         far = np.linalg.norm(arms, axis=2)
@@ -191,19 +191,19 @@ def _polyhedron_gap(corners: Array) -> GapFunction:
 
 @dataclass(frozen=True)
 class Pose:
-    """Position of an obstacle: x = R (z - about) + about + shift."""
+    """Position of an obstacle: x = R (z - c) + c + shift."""
 
-    turn: Array
-    about: Array
+    rotation: Array
+    rotation_centre: Array
     shift: Array
 
-    def into(self, x: Array) -> Array:
+    def to_obstacle_frame(self, x: Array) -> Array:
         """Return points in the frame of the obstacle."""
-        return (x - self.about - self.shift) @ self.turn + self.about
+        return (x - self.rotation_centre - self.shift) @ self.rotation + self.rotation_centre
 
-    def out(self, z: Array) -> Array:
+    def to_space(self, z: Array) -> Array:
         """Return points in space."""
-        return (z - self.about) @ self.turn.T + self.about + self.shift
+        return (z - self.rotation_centre) @ self.rotation.T + self.rotation_centre + self.shift
 
 
 @dataclass(eq=False)
@@ -225,30 +225,30 @@ class FiniteContact(reference.ContactModel):
 
     Attributes:
         shape: Gap function of the obstacle in its first position.
-        about: A point on the axis of rotation.
+        rotation_centre: A point on the axis of rotation.
         axis: Direction of the axis in 3D; None in the plane.
-        turns: Whether the obstacle rotates.
+        rotates: Whether the obstacle rotates.
     """
 
     shape: Any = None
-    about: Any = None
+    rotation_centre: Any = None
     axis: Any = None
-    turns: bool = False
+    rotates: bool = False
 
     def pose(self, shift: Array, angle: float) -> Pose:
         """Return the position of the obstacle."""
-        if not self.turns:
+        if not self.rotates:
             return Pose(np.eye(self.d), np.zeros(self.d), shift)
         if self.d == 2:
-            turn = scipy.spatial.transform.Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
-            return Pose(turn[:2, :2], self.about, shift)
+            rotation = scipy.spatial.transform.Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
+            return Pose(rotation[:2, :2], self.rotation_centre, shift)
         along = angle * self.axis / np.linalg.norm(self.axis)
-        turn = scipy.spatial.transform.Rotation.from_rotvec(along).as_matrix()
-        return Pose(turn, self.about, shift)
+        rotation = scipy.spatial.transform.Rotation.from_rotvec(along).as_matrix()
+        return Pose(rotation, self.rotation_centre, shift)
 
     def centreline_at(self, shift: Any) -> Array:
         """Return the centreline of a rod."""
-        return shift.out(self.centreline)
+        return shift.to_space(self.centreline)
 
     def initial_state(self) -> FiniteState:
         """Return the state without traction, on the obstacle in its first position."""
@@ -261,16 +261,16 @@ class FiniteContact(reference.ContactModel):
         """Return tractions and local kinematics; ``shift`` is a `Pose`."""
         pose, law = shift, self.law
         x = self.x + jump
-        distance, local_normal = self.shape(pose.into(x))
-        n = local_normal @ pose.turn.T
+        distance, local_normal = self.shape(pose.to_obstacle_frame(x))
+        n = local_normal @ pose.rotation.T
         closest = x + distance[:, None] * n
 
         def across(vector: Array) -> Array:
             return vector - np.sum(vector * n, axis=1)[:, None] * n
 
-        step = across(closest - pose.out(old.jump))
+        step = across(closest - pose.to_space(old.jump))
         before = across(
-            _rotate_with_normal(old.traction @ pose.turn.T, old.normal @ pose.turn.T, n)
+            _rotate_with_normal(old.traction @ pose.rotation.T, old.normal @ pose.rotation.T, n)
         )
         overclosure = -distance
         r_n = law.normal_traction(self.k_n, overclosure, old.pressure)
@@ -278,14 +278,17 @@ class FiniteContact(reference.ContactModel):
         traction = r_n[:, None] * n + tau
         found = {"normal": n, "overclosure": overclosure, "slip": step}
         found |= {"tau_old": before, "r_n": r_n, "tau": tau, "traction": traction}
-        found |= {"relative": pose.into(x) - self.x, "projection": pose.into(closest)}
-        found |= {"tau_local": tau @ pose.turn, "n_local": local_normal}
-        return found | {"turn": pose.turn}
+        found |= {
+            "relative": pose.to_obstacle_frame(x) - self.x,
+            "projection": pose.to_obstacle_frame(closest),
+        }
+        found |= {"tau_local": tau @ pose.rotation, "n_local": local_normal}
+        return found | {"rotation": pose.rotation}
 
     def gap_at(self, x: Array, pose: Pose) -> tuple[Array, Array]:
         """Return gap and normal at points in space."""
-        distance, local_normal = self.shape(pose.into(x))
-        return distance, local_normal @ pose.turn.T
+        distance, local_normal = self.shape(pose.to_obstacle_frame(x))
+        return distance, local_normal @ pose.rotation.T
 
     def initial_position(self) -> Pose:
         """Return the first position of the obstacle."""
@@ -314,7 +317,7 @@ class FiniteContact(reference.ContactModel):
         if self.law.has_friction:
             change = found["tau_old"] - found["tau"]
             slip = self.law.elastic_slip(self.k_t, found["normal"], change)
-            reference_point = reference_point - slip @ found["turn"]
+            reference_point = reference_point - slip @ found["rotation"]
         return FiniteState(reference_point, old.traction.copy(), old.pressure, None, old.normal)
 
 
@@ -352,7 +355,7 @@ class FiniteProblem(reference.Problem):
 
     bulk: Any = None
     before: Any = None
-    subdivisions: tuple[int, ...] = _PARTS
+    subdivisions: tuple[int, ...] = _SUBDIVISIONS
 
     def stiffness(self, u: Array) -> Array:
         """Return the tangent stiffness of the bulk."""
@@ -377,14 +380,16 @@ class FiniteProblem(reference.Problem):
     ) -> tuple[Array, Array, list[Any]]:
         """Solve one increment in parts, with the arguments of `reference.Problem.solve`."""
         for n_parts in self.subdivisions:
-            with contextlib.suppress(Failed, np.linalg.LinAlgError):
+            with contextlib.suppress(NotSolved, np.linalg.LinAlgError):
                 v, m = u, motion
-                for share in np.arange(1, n_parts + 1) / n_parts:
-                    v, m = self.equilibrate(v, m, self._interpolate_load(load, share), old, rtol)
+                for fraction in np.arange(1, n_parts + 1) / n_parts:
+                    v, m = self.equilibrate(v, m, self._interpolate_load(load, fraction), old, rtol)
                 break
         else:
             v, m = self._solve_with_softer_springs(u, motion, load, old, rtol)
-        for _ in range(_ROUNDS if any(c.projection is not None for c in self.contacts) else 0):
+        for _ in range(
+            _MAX_AUGMENTATIONS if any(c.projection is not None for c in self.contacts) else 0
+        ):
             found = self.evaluate(v, m, load, old)
             new = [
                 c.augment(f, o) if c.projection is not None else o
@@ -395,12 +400,12 @@ class FiniteProblem(reference.Problem):
             change = max(change, *(np.abs(a.traction - b.traction).max() for a, b in pairs))
             scale = max(np.abs(a.pressure).max() + np.abs(a.traction).max() for a, _ in pairs)
             old = new
-            if change <= 1e-8 * scale + self.rounding():
+            if change <= 1e-8 * scale + self.traction_roundoff():
                 break
             v, m = self.equilibrate(v, m, load, old, rtol)
         else:
             if any(c.projection is not None for c in self.contacts):
-                raise Failed("multipliers do not converge")
+                raise NotSolved("multipliers do not converge")
         self.before = load
         return v, m, old
 
@@ -410,7 +415,7 @@ class FiniteProblem(reference.Problem):
         """Solve by continuation in the contact stiffness."""
         whole = [(c.k_n, c.k_t) for c in self.contacts]
         try:
-            for factor in _SOFTER:
+            for factor in _STIFFNESS_FACTORS:
                 for contact, (k_n, k_t) in zip(self.contacts, whole, strict=True):
                     contact.k_n, contact.k_t = factor * k_n, factor * k_t
                 u, motion = self.equilibrate(u, motion, load, old, rtol)
@@ -419,16 +424,16 @@ class FiniteProblem(reference.Problem):
                 contact.k_n, contact.k_t = k_n, k_t
         return u, motion
 
-    def _interpolate_load(self, load: Any, share: float) -> Any:
-        """Return the load at a fraction ``share`` of the increment, by linear interpolation."""
-        if share == 1.0:
+    def _interpolate_load(self, load: Any, fraction: float) -> Any:
+        """Return the load at a ``fraction`` of the increment, by linear interpolation."""
+        if fraction == 1.0:
             return load
         first = self.before
 
         def mean(name: str) -> Any:
             end = getattr(load, name)
             start = getattr(first, name) if first is not None else [0.0 * v for v in end]
-            return [s + share * (e - s) for s, e in zip(start, end, strict=True)]
+            return [s + fraction * (e - s) for s, e in zip(start, end, strict=True)]
 
         angle = 0.0 if first is None else first.angle
         return replace(
@@ -437,7 +442,7 @@ class FiniteProblem(reference.Problem):
             values=np.array(mean("values")),
             shifts=mean("shifts"),
             obstacle_forces=mean("obstacle_forces"),
-            angle=angle + share * (load.angle - angle),
+            angle=angle + fraction * (load.angle - angle),
         )
 
     def equilibrate(
@@ -473,7 +478,7 @@ class FiniteProblem(reference.Problem):
         u[load.fixed] = load.values
         residual, size, roundoff, whole = evaluate(u, motion)
         if not whole:
-            raise Failed("cells are inverted")
+            raise NotSolved("cells are inverted")
         best, idle = (np.inf, u, motion, size, roundoff), 0
         for iteration in range(80):
             norm = float(np.linalg.norm(residual))
@@ -492,11 +497,11 @@ class FiniteProblem(reference.Problem):
                 system = tangent(u, motion, stick=True) / scale[:, None] / scale
             step = -np.linalg.solve(system, residual / scale) / scale
             first = np.linalg.norm(residual / scale)
-            share, low, high, chosen = 1.0, 0.0, np.inf, None
+            step_length, low, high, chosen = 1.0, 0.0, np.inf, None
             for _ in range(40 if not is_constrained else 12):
                 v, m = u.copy(), motion.copy()
-                v[free_dofs] += share * step[: len(free_dofs)]
-                m += share * step[len(free_dofs) :]
+                v[free_dofs] += step_length * step[: len(free_dofs)]
+                m += step_length * step[len(free_dofs) :]
                 now = evaluate(v, m)
                 valid = now[3] and np.isfinite(now[0]).all()
                 if valid:
@@ -506,22 +511,22 @@ class FiniteProblem(reference.Problem):
                     along, slope = now[0] @ step, residual @ step
                     if valid and abs(along) <= 0.3 * abs(slope):
                         break
-                    low, high = (share, high) if valid and along < 0 else (low, share)
-                    share = 2 * share if high == np.inf else 0.5 * (low + high)
+                    low, high = (step_length, high) if valid and along < 0 else (low, step_length)
+                    step_length = 2 * step_length if high == np.inf else 0.5 * (low + high)
                     continue
                 # Every ninth iteration accepts a larger residual, to leave a cycle.
-                free_pass = iteration % 9 == 8 and share < 0.5
+                free_pass = iteration % 9 == 8 and step_length < 0.5
                 if valid and (
-                    free_pass or np.linalg.norm(now[0] / scale) < (1 - 0.1 * share) * first
+                    free_pass or np.linalg.norm(now[0] / scale) < (1 - 0.1 * step_length) * first
                 ):
                     break
-                share *= 0.5
+                step_length *= 0.5
             if chosen is None:
                 break
             u, motion, (residual, size, roundoff, _) = chosen
         norm, u, motion, size, roundoff = best
         if norm > 1e3 * rtol * size and norm > 1e-13 * roundoff:
-            raise Failed(f"residual {norm / max(size, 1e-300):.1e} of the forces")
+            raise NotSolved(f"residual {norm / max(size, 1e-300):.1e} of the forces")
         return u, motion
 
     def _tangent(
@@ -588,12 +593,12 @@ def make_problem(
         )
         contact_model.shape = make_shape(scene, contact)
         contact_model.deformed_gap = contact_model.gap_at
-        turn = setup.turn(contact)
-        if turn is not None:
-            contact_model.turns = True
-            contact_model.about, contact_model.axis = (
-                np.array(turn[0], dtype=float),
-                None if turn[1] is None else np.array(turn[1], dtype=float),
+        axis = setup.rotation_axis(contact)
+        if axis is not None:
+            contact_model.rotates = True
+            contact_model.rotation_centre, contact_model.axis = (
+                np.array(axis[0], dtype=float),
+                None if axis[1] is None else np.array(axis[1], dtype=float),
             )
         contacts.append(contact_model)
     return FiniteProblem(body, contacts, bulk=make_bulk(setup, body)), setup, make_loads(setup)
@@ -649,7 +654,7 @@ def make_loads(setup: Any) -> Callable[[int, float], FiniteLoad]:
 # ---- comparison ----------------------------------------------------------------------------------
 
 
-class FiniteJudge(fuzz_judge.Judge):
+class FiniteComparison(fuzz_comparison.Comparison):
     """Compares increments of the package with the independent solver, with finite kinematics.
 
     Energies are not compared. With friction, rubber or curved obstacles an increment may have

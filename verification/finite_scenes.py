@@ -105,8 +105,8 @@ def draw(
         obstacle["flat"] = within(0.6, 1.0)
     if kind == "facets":
         obstacle["points"] = pick(12, 24, 60, of=rng)
-    turns = chance(0.6, "turn")
-    if turns:
+    rotates = chance(0.6, "turn")
+    if rotates:
         obstacle["turn"] = "middle" if kind in _ROUND and chance(0.6, of=rng) else "aside"
         if space:
             obstacle["about"] = pick([0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.3, 1.0, 0.2], of=rng)
@@ -134,9 +134,9 @@ def draw(
     # Stages: strain at their end, sliding distance in widths of the body, angle in radians.
     far = pick(strain, strain, 0.1, 0.4, of=rng)
     most_turned = 0.5 * strain
-    if turns and obstacle["turn"] == "middle":
+    if rotates and obstacle["turn"] == "middle":
         most_turned = pick(0.3, 1.5, 6.3, of=rng)
-    elif turns and obstacle.get("about") == [0.0, 0.0, 1.0]:
+    elif rotates and obstacle.get("about") == [0.0, 0.0, 1.0]:
         most_turned = pick(0.3, 1.0, of=rng)
     stages, angle = [], 0.0
     for name in pick(
@@ -164,7 +164,7 @@ def draw(
             "both": (1.0, rng.uniform(-1, 1)),
             "off": (0.1, 0.0),
         }[name]
-        if turns and name in ("turn", "both"):
+        if rotates and name in ("turn", "both"):
             angle += most_turned * rng.uniform(-1, 1)
         if name == "back":
             angle *= 0.3
@@ -176,7 +176,7 @@ def draw(
                 "normal": normal,
                 "side": float(f"{side * far:.3g}"),
                 "across": float(f"{side * far * rng.uniform(-1, 1):.3g}") if space else 0.0,
-                "turn": float(f"{angle:.3g}") if turns else 0.0,
+                "turn": float(f"{angle:.3g}") if rotates else 0.0,
             }
             | ({"friction": pick(0.5, 1.5, of=rng)} if changes else {})
         )
@@ -371,9 +371,9 @@ class FiniteSetup(SceneSetup):
                 force, 0.02 * scene["strain"] * self.moduli[0] * area
             )
             self.obstacle_motion[i].value = by_obstacle[i] * self.length
-        self.apply_features(stage, t)
+        self.apply_additional_features(stage, t)
 
-    def turn(self, contact: Scene) -> tuple[Array, Array | None] | None:
+    def rotation_axis(self, contact: Scene) -> tuple[Array, Array | None] | None:
         """Return a point on the axis of rotation and its direction, or None without rotation."""
         given = contact["obstacle"]
         if "turn" not in given:
@@ -403,9 +403,9 @@ class FiniteSetup(SceneSetup):
                 force=[self.obstacle_force[i] if i in free else None for i in range(d)],
                 displacement=[None if i in free else self.obstacle_motion[i] for i in range(d)],
             )
-        turn = self.turn(contact)
-        if turn is not None:
-            about, axis = turn
+        rotation = self.rotation_axis(contact)
+        if rotation is not None:
+            about, axis = rotation
             move["rotation"] = fc.Rotation(
                 self.angle, about.tolist(), None if axis is None else axis.tolist()
             )

@@ -88,7 +88,7 @@ class Outcome:
         increments: Number of increments that were solved and compared.
         seconds: Time of both solvers.
         detail: Texts of errors and failed checks.
-        worst: By check, the largest ratio of error to tolerance.
+        error_ratios: By check, the largest ratio of error to tolerance.
         by: Method that solves a refused scene alone.
     """
 
@@ -97,7 +97,7 @@ class Outcome:
     increments: int
     seconds: float
     detail: list[str]
-    worst: dict[str, float]
+    error_ratios: dict[str, float]
     by: str = ""
 
 
@@ -172,17 +172,20 @@ def run_scene(
     """
     from mpi4py import MPI
 
-    from verification import fuzz_judge, fuzz_setup
+    from verification import fuzz_comparison, fuzz_setup
 
-    setup_class, judge_class = fuzz_setup.SceneSetup, fuzz_judge.Judge
+    setup_class, comparison_class = fuzz_setup.SceneSetup, fuzz_comparison.Comparison
     if scene.get("kinematics") == "finite":
         from verification import finite_reference, finite_scenes
 
-        setup_class, judge_class = finite_scenes.FiniteSetup, finite_reference.FiniteJudge
+        setup_class, comparison_class = finite_scenes.FiniteSetup, finite_reference.FiniteComparison
     elif scene.get("kinematics") == "finite sliding":
         from verification import sliding_reference, sliding_scenes
 
-        setup_class, judge_class = sliding_scenes.SlidingSetup, sliding_reference.SlidingJudge
+        setup_class, comparison_class = (
+            sliding_scenes.SlidingSetup,
+            sliding_reference.SlidingComparison,
+        )
     comm = comm or MPI.COMM_SELF
     records: list[dict[str, Any]] = []
     start, outcome, kind, detail = time.perf_counter(), "right", "", []
@@ -204,7 +207,7 @@ def run_scene(
             detail.append(f"{trace.filename}:{trace.lineno}")
     if comm.rank:
         return Outcome(outcome, kind, len(records), 0.0, [], {})
-    worst: dict[str, float] = {}
+    error_ratios: dict[str, float] = {}
     try:
         with (
             warnings.catch_warnings(),
@@ -216,32 +219,39 @@ def run_scene(
                 for record in records:
                     del record["contacts"][len(scene["contacts"]) :]
                     record["energy"] = None
-            judge = judge_class(scene) if records or outcome != "right" else None
+            comparison = comparison_class(scene) if records or outcome != "right" else None
             for record in records:
                 if perturb is not None:
                     perturb(record)
-                judge.check_increment(record)
-                if judge.wrong:
+                comparison.check_increment(record)
+                if comparison.failed_checks:
                     break
             ahead = _next_load(scene, records)
-            if outcome in ("refused", "slow") and judge is not None and not judge.wrong and ahead:
-                kind += f" ({judge.try_next_load(*ahead)})"
-        if judge is not None:
-            worst = judge.worst
-            if judge.wrong:
+            if (
+                outcome in ("refused", "slow")
+                and comparison is not None
+                and not comparison.failed_checks
+                and ahead
+            ):
+                kind += f" ({comparison.try_next_load(*ahead)})"
+        if comparison is not None:
+            error_ratios = comparison.error_ratios
+            if comparison.failed_checks:
                 outcome = "wrong"
-                kind = ", ".join(sorted({w.split(":")[0] for w in judge.wrong}))
+                kind = ", ".join(sorted({w.split(":")[0] for w in comparison.failed_checks}))
                 unpaired = any(c["unpaired"] for c in records[-1]["contacts"])
-                if unpaired and all(w.startswith(_DERIVED_RESULTS) for w in judge.wrong):
+                if unpaired and all(
+                    w.startswith(_DERIVED_RESULTS) for w in comparison.failed_checks
+                ):
                     kind = "unpaired points: " + kind
-                detail = judge.wrong[:6]
-            elif outcome == "right" and judge.another:
-                outcome, detail = "another", judge.another[:3]
-            detail = detail + judge.unjudged[:2]
+                detail = comparison.failed_checks[:6]
+            elif outcome == "right" and comparison.other_solutions:
+                outcome, detail = "another", comparison.other_solutions[:3]
+            detail = detail + comparison.not_compared[:2]
     except (_TimeLimitExceeded, Exception) as error:
         outcome, kind = "unjudged", type(error).__name__
         detail = traceback.format_exc().strip().splitlines()[-6:]
-    return Outcome(outcome, kind, len(records), time.perf_counter() - start, detail, worst)
+    return Outcome(outcome, kind, len(records), time.perf_counter() - start, detail, error_ratios)
 
 
 def find_solving_method(scene: Scene, comm: Any = None, *, limit: float | None = None) -> str:
@@ -462,7 +472,7 @@ def run_campaign(arguments: argparse.Namespace) -> Counter[str]:
     counts: Counter[str] = Counter()
     lock = threading.Lock()
 
-    def note(found: dict[str, Any]) -> None:
+    def append_outcome(found: dict[str, Any]) -> None:
         scene = _draw_scene(found["seed"], arguments, arguments.ranks)
         row = {n: found.get(n) for n in FIELDS} | {
             "ranks": arguments.ranks,
@@ -489,7 +499,7 @@ def run_campaign(arguments: argparse.Namespace) -> Counter[str]:
         while own:
             got = set()
             for found in _start_batch(own[:_BATCH_SIZE], arguments):
-                note(found)
+                append_outcome(found)
                 got.add(found["seed"])
             if not got:
                 raise RuntimeError(f"no scene of {own[:_BATCH_SIZE]} could be started")
@@ -632,7 +642,7 @@ def minimise(
 
 def _method_remark(row: dict[str, str]) -> str:
     """Return a remark on the method that solves a refused scene alone; empty in older files."""
-    return f", though {row['by']} alone solves it" if row.get("by") else ""
+    return f", solved by {row['by']}" if row.get("by") else ""
 
 
 def make_table(paths: list[str]) -> str:
@@ -646,7 +656,7 @@ def make_table(paths: list[str]) -> str:
         for name in ["all", f"ranks {row['ranks']}", *row["features"].split("; ")]:
             by_feature.setdefault(name, Counter())[row["outcome"]] += 1
     lines = [
-        f"{len(rows)} scenes, {sum(int(r['increments']) for r in rows)} increments judged.",
+        f"{len(rows)} scenes, {sum(int(r['increments']) for r in rows)} increments compared.",
         "",
     ]
     lines += ["| feature | scenes | " + " | ".join(OUTCOMES) + " |"]
@@ -725,7 +735,7 @@ def main() -> int:
         print(json.dumps(scene))
         print(f"{outcome.outcome}: {outcome.kind} ({outcome.increments} increments)")
         print(*outcome.detail, sep="\n")
-        print({k: float(f"{v:.2g}") for k, v in outcome.worst.items()})
+        print({k: float(f"{v:.2g}") for k, v in outcome.error_ratios.items()})
     return int(bad)
 
 

@@ -20,7 +20,7 @@ from verification.fuzz_scenes import Scene, make_samplers
 __all__ = ["UNRELATED_BODIES", "add_features", "feature_names", "with_unrelated_body"]
 
 # Position of unrelated bodies along x, in units of length.
-_DISTANCE = 30.0
+_UNRELATED_BODY_POSITION = 30.0
 # Unrelated bodies: E relative to the scene, displacement of the top (length) or its traction
 # divided by E, and whether the bottom is on a floor with friction.
 UNRELATED_BODIES: dict[str, Scene] = {
@@ -30,9 +30,9 @@ UNRELATED_BODIES: dict[str, Scene] = {
     "stiff": {"E": 1e6, "moved": [0.0, -1e-2], "floor": True},
     "soft": {"E": 1e-6, "load": [0.0, -1e-2], "floor": True},
     "light": {"E": 1.0, "load": [1e-8, -1e-7], "floor": True},
-    "far away": {"E": 1.0, "load": [0.0, -1e-2], "floor": True, "place": 1e4},
+    "far away": {"E": 1.0, "load": [0.0, -1e-2], "floor": True, "position": 1e4},
 }
-_FEW_UNKNOWNS = 2
+_N_CELLS_PER_EDGE = 2
 
 
 def add_features(scene: Scene, seed: int, without: tuple[str, ...] = ()) -> Scene:
@@ -106,38 +106,38 @@ def _add_rod(scene: Scene, chance: Any, pick: Any, log: Any, within: Any) -> Non
     obstacle = {"kind": "rod", "shape": shape, "radius": radius, "half": half, "tilt": tilt}
     obstacle |= {"clearance": clearance, "at": within(-0.1, 1.1), "moving": "displacement"}
     depth = (log(-4, -1.3) if finite else log(-5, -2.3)) * height
-    whole = 2 * (radius + half * abs(np.sin(tilt)))
+    extent = 2 * (radius + half * abs(np.sin(tilt)))
     reach = width + 2 * half * abs(np.cos(tilt))
     press = clearance + depth
-    through = clearance + whole + within(0.05, 0.9) * height
-    aside = within(0.2, 1.3) * reach * pick(-1.0, 1.0)
-    ways = pick(
+    through = clearance + extent + within(0.05, 0.9) * height
+    lateral = within(0.2, 1.3) * reach * pick(-1.0, 1.0)
+    path = pick(
         [(press, 0.0)],
-        [(press, 0.0), (press, aside)],
-        [(press, 0.0), (press, aside), (press, 0.3 * aside)],
+        [(press, 0.0), (press, lateral)],
+        [(press, 0.0), (press, lateral), (press, 0.3 * lateral)],
         [(through, 0.0)],
-        [(through, aside)],
+        [(through, lateral)],
         [(press, 0.0), (through, 0.0)],
-        [(press, 0.0), (0.0, aside), (press, 0.0)],
-        [(press, aside)],
+        [(press, 0.0), (0.0, lateral), (press, 0.0)],
+        [(press, lateral)],
     )
     if chance(0.2):  # the rod approaches from the side
         sign = pick(-1.0, 1.0)
         obstacle["at"] = float(f"{0.5 - sign * (0.55 + 0.5 * (reach - width) / width):.4g}")
         obstacle["clearance"] = -depth
-        ways = [(0.0, -sign * within(0.1, 1.5) * reach)]
-    turns = finite and chance(0.3)
-    if turns:
+        path = [(0.0, -sign * within(0.1, 1.5) * reach)]
+    rotates = finite and chance(0.3)
+    if rotates:
         obstacle |= {"turn": "middle"} | ({"about": [0.0, 1.0, 0.0]} if d == 3 else {})
     contact["obstacle"] = obstacle
     strain = scene["strain"]
     stages = []
-    for up, side in ways:
+    for up, side in path:
         along = side / width if finite else side / (height * strain)
         stage = {"steps": pick(1, 1, 2, 4), "normal": up / (height * strain)}
         stage |= {"side": -along if finite else along, "across": 0.0}
         if finite:
-            stage["turn"] = within(-1.0, 1.0) if turns else 0.0
+            stage["turn"] = within(-1.0, 1.0) if rotates else 0.0
         stages.append({n: v if n == "steps" else float(f"{v:.4g}") for n, v in stage.items()})
     scene |= {"bodies": [body], "contacts": [contact], "layout": "floor", "drive": "obstacle"}
     scene |= {"dirichlet": [[0, "top", list(range(d)), "fixed"]], "load_ratio": 1.0}
@@ -156,8 +156,11 @@ def with_unrelated_body(scene: Scene) -> Scene:
         return scene
     unrelated = UNRELATED_BODIES[scene["unrelated_body"]]
     d, first = len(scene["bodies"][0]["size"]), scene["bodies"][0]
-    body = {"origin": [unrelated.get("place", _DISTANCE)] + [0.0] * (d - 1), "size": [1.0] * d}
-    n = [_FEW_UNKNOWNS if d == 2 else 1] * d
+    body = {
+        "origin": [unrelated.get("position", _UNRELATED_BODY_POSITION)] + [0.0] * (d - 1),
+        "size": [1.0] * d,
+    }
+    n = [_N_CELLS_PER_EDGE if d == 2 else 1] * d
     body |= {"n": n, "E": first["E"] * unrelated["E"], "jitter": 0}
     number = len(scene["bodies"])
     found = scene | {"bodies": [*scene["bodies"], body]}

@@ -23,7 +23,7 @@ from verification.reference_geometry import Body, Surface
 __all__ = ["capsule_gap_at", "make_body", "make_contact", "make_problem"]
 
 # Slip up to which points at the edge keep their opposite points, relative to the facet length.
-_EDGE_SLIDE = 0.05
+_EDGE_SLIP_RATIO = 0.05
 
 
 def _relative_factor(value: float | None, contact: Scene) -> float:
@@ -238,8 +238,8 @@ def capsule_gap_at(x: Array, where: dict[str, Any]) -> tuple[Array, Array]:
     """Return the distances of points from a capsule, (n,), and minus their gradients, (n, d)."""
     low, high = where["ends"]
     direction = high - low
-    share = (x - low) @ direction / max(direction @ direction, np.finfo(float).tiny)
-    arm = x - low - np.clip(share.real, 0.0, 1.0)[:, None] * direction
+    fraction = (x - low) @ direction / max(direction @ direction, np.finfo(float).tiny)
+    arm = x - low - np.clip(fraction.real, 0.0, 1.0)[:, None] * direction
     arm = arm * where.get("flat", 1.0)
     far = np.sqrt(np.sum(arm * arm, axis=1))
     return far - where["radius"], -arm / far[:, None]
@@ -252,18 +252,18 @@ def _make_contact(setup: SceneSetup, contact: Scene, slave: Surface, opposite: A
     scene, given, x = setup.scene, contact.get("gap"), model.x
     if master is None:
         kind, where = contact["obstacle"]["kind"], obstacle_geometry(scene, contact)
-        place = _gap_function(kind, where, x)
+        gap_at = _gap_function(kind, where, x)
         model.radius = float(where.get("radius", 0.0))
         if given is None and kind != "obstacle":
             model.deformed_gap = lambda x, shift: _gap_function(kind, where, x)(shift)
         if given is not None:
-            bare = place
+            unprescribed_gap = gap_at
 
-            def place(shift: Array) -> tuple[Array, Array]:
-                normal = bare(shift)[1]
+            def gap_at(shift: Array) -> tuple[Array, Array]:
+                normal = unprescribed_gap(shift)[1]
                 return given * setup.length + normal @ shift, normal
 
-        model.gap_function = place
+        model.gap_function = gap_at
         return model
     normal = slave.normal(facet, xi)
     interpolation = model.interpolation
@@ -279,19 +279,27 @@ def _make_contact(setup: SceneSetup, contact: Scene, slave: Surface, opposite: A
     gap = model.gap_function(np.zeros(setup.d))[0]
     if given is None and not model.law.tension:
         thickness = scene.get("thickness", 1.0)
-        model.overlap = lambda u: reference_geometry.find_overlap(master, slave, u, thickness)
+        model.opposite_penetration = lambda u: reference_geometry.integrate_penetration(
+            master, slave, u, thickness
+        )
     if contact["obstacle"]["update_pairs"] != "never":
         model.update_pairs = update_pairs
     if given is None:
 
         def find_current_pairs(u: Array) -> tuple[Array, Array, Array]:
-            matrix, where, met = reference_geometry.find_pairs(slave, master, (facet, xi), u=u)
+            matrix, current_gap, is_paired = reference_geometry.find_pairs(
+                slave, master, (facet, xi), u=u
+            )
             # At the edge any strain may separate a point from its opposite point.
-            slid = np.linalg.norm(model.jump(u), axis=1) > _EDGE_SLIDE * slave.lengths()[facet]
-            met, lost = met | ~slid, ~met & ~slid
-            rows = np.where(met[:, None], interpolation - matrix, 0.0)
-            rows[lost] = model.interpolation[lost]
-            return rows, np.where(lost, gap, where), np.where(lost, model.paired, met)
+            slid = np.linalg.norm(model.jump(u), axis=1) > _EDGE_SLIP_RATIO * slave.lengths()[facet]
+            is_paired, keeps_pair = is_paired | ~slid, ~is_paired & ~slid
+            rows = np.where(is_paired[:, None], interpolation - matrix, 0.0)
+            rows[keeps_pair] = model.interpolation[keeps_pair]
+            return (
+                rows,
+                np.where(keeps_pair, gap, current_gap),
+                np.where(keeps_pair, model.paired, is_paired),
+            )
 
         model.current_pairs = find_current_pairs
     return model
@@ -313,12 +321,12 @@ def _gap_function(kind: str, where: dict[str, Any], x: Array) -> Any:
     if kind.startswith("cylinder") and len(flat) == 3:
         flat[1] = 0.0
 
-    def place(s: Array) -> tuple[Array, Array]:
+    def gap_at(s: Array) -> tuple[Array, Array]:
         arm = (x - where["center"] - s) * flat
         distance = np.sqrt(np.sum(arm * arm, axis=1))
         return sign * (distance - where["radius"]), -sign * arm / distance[:, None]
 
-    return place
+    return gap_at
 
 
 def _l2_projection(slave: Surface, facet: Array, xi: Array, weights: Array, degree: int) -> Array:

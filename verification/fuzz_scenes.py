@@ -270,8 +270,8 @@ def draw(
         contacts.insert(1, other)
     if layout == "pair" and chance(0.08, "narrow", of=rng):
         bodies[1]["size"][0] = float(f"{rng.uniform(0.03, 0.3) * bodies[0]['size'][0]:.3g}")
-        room = bodies[0]["size"][0] - bodies[1]["size"][0]
-        bodies[1]["origin"][0] = float(f"{rng.uniform(0.02, 0.98) * room:.3g}")
+        free_width = bodies[0]["size"][0] - bodies[1]["size"][0]
+        bodies[1]["origin"][0] = float(f"{rng.uniform(0.02, 0.98) * free_width:.3g}")
     if chance(0.1):
         scene["thickness"] = log(-2, 2)
 
@@ -370,22 +370,22 @@ def draw(
     if chance(0.08, "max_iterations", of=rng):
         scene["max_iterations"] = int(rng.integers(3, 9))
     if "far" not in without:
-        _slide_far(scene, np.random.default_rng([seed, 29]))
+        _extend_block_sliding(scene, np.random.default_rng([seed, 29]))
     return scene | draw_form(seed, family, without)
 
 
-def _slide_far(scene: Scene, rng: np.random.Generator) -> None:
+def _extend_block_sliding(scene: Scene, rng: np.random.Generator) -> None:
     """Let a driven block slide by 0.02 to 0.6 of its height, across facets or past an end."""
     pairs = [c["obstacle"] for c in scene["contacts"] if c["obstacle"]["kind"] == "body"]
     small = scene["strain"] < 0.02 and "bend" not in scene
     searched = scene["degree"] == 1 and scene["cell"] != "hexahedron"
-    led = scene["layout"] == "pair" and scene["drive"] == "prescribed" and len(pairs) == 1
-    if not (small and searched and led) or rng.random() > 0.4:
+    is_driven = scene["layout"] == "pair" and scene["drive"] == "prescribed" and len(pairs) == 1
+    if not (small and searched and is_driven) or rng.random() > 0.4:
         return
     pairs[0]["update_pairs"] = "auto" if rng.random() < 0.7 else "increment"
     for stage in scene["stages"]:
-        way = np.sign(stage["side"]) * rng.uniform(0.02, 0.6) / scene["strain"]
-        stage["side"] = float(f"{way:.3g}")
+        distance = np.sign(stage["side"]) * rng.uniform(0.02, 0.6) / scene["strain"]
+        stage["side"] = float(f"{distance:.3g}")
         # The contact force of surfaces that just touch would be round-off, or zero.
         stage["normal"] = stage["normal"] or -0.3
 

@@ -67,8 +67,12 @@ def _make_quadratic(cell: str, x: Array, cells: Array, boxes: Array) -> tuple[Ar
     element = basix.ufl.element("Lagrange", cell, 1, shape=(x.shape[1],))
     straight = dolfinx.mesh.create_mesh(MPI.COMM_SELF, cells=cells, x=x, e=ufl.Mesh(element))
     nodes = fem.functionspace(straight, ("Lagrange", 2))
-    places = nodes.tabulate_dof_coordinates()[:, : x.shape[1]]
-    return places, nodes.dofmap.list.astype(np.int64), boxes[straight.topology.original_cell_index]
+    node_coordinates = nodes.tabulate_dof_coordinates()[:, : x.shape[1]]
+    return (
+        node_coordinates,
+        nodes.dofmap.list.astype(np.int64),
+        boxes[straight.topology.original_cell_index],
+    )
 
 
 _SIDES = {
@@ -208,13 +212,13 @@ class SceneSetup:
     def _bend(self) -> None:
         """Raise the nodes of the bodies by a parabola in x."""
         x = self.mesh.geometry.x
-        on_increment = np.zeros(len(x), dtype=bool)
+        is_displaced = np.zeros(len(x), dtype=bool)
         for b, (body, rise) in enumerate(
             zip(self.scene["bodies"], self.scene["bend"], strict=True)
         ):
             nodes = np.unique(compat.geometry_dofmap(self.mesh)[self.cell_body == b])
-            nodes = nodes[~on_increment[nodes]]
-            on_increment[nodes] = True
+            nodes = nodes[~is_displaced[nodes]]
+            is_displaced[nodes] = True
             middle = (body["origin"][0] + 0.5 * body["size"][0]) * self.length
             width = body["size"][0] * self.length
             x[nodes, self.d - 1] += rise * width * (2 * (x[nodes, 0] - middle) / width) ** 2
@@ -287,9 +291,9 @@ class SceneSetup:
         tractions = np.zeros((len(scene["bodies"]), d))
         pulled = scene["drive"] == "force"
         for k, b in enumerate(loaded_bodies):
-            share = scene["load_ratio"] if k else 1.0
+            load_factor = scene["load_ratio"] if k else 1.0
             if pulled:
-                tractions[b] = direction * strain * self.moduli[b] * share
+                tractions[b] = direction * strain * self.moduli[b] * load_factor
         self.traction.x.array.reshape(-1, d)[self._cells] = tractions[self.cell_body]
         heavy = np.zeros(d)
         heavy[-1] = -scene.get("weight", 0.0) * strain * self.stress / self.length
@@ -297,9 +301,9 @@ class SceneSetup:
         own = (self.cell_body < self.n_scene_bodies)[:, None]
         self.weight.x.array.reshape(-1, d)[self._cells] = np.where(own, heavy, 0.0)
         for body, i, value in self.moved:
-            share = scene["load_ratio"] if loaded_bodies.index(body) else 1.0
+            load_factor = scene["load_ratio"] if loaded_bodies.index(body) else 1.0
             size = scene["bodies"][body]["size"][-1] * self.length
-            value.value = direction[i] * strain * size * share
+            value.value = direction[i] * strain * size * load_factor
         if scene["drive"] == "obstacle":
             size = scene["bodies"][0]["size"][-1] * self.length
             self.shift.value[:] = -direction * strain * size
@@ -307,15 +311,15 @@ class SceneSetup:
             for i in range(d):
                 self.obstacle_force[i].value = -direction[i] * strain * self.moduli[0] * area
                 self.obstacle_motion[i].value = -direction[i] * strain * size
-        self.apply_features(stage, t)
+        self.apply_additional_features(stage, t)
 
-    def apply_features(self, stage: int, t: float) -> None:
+    def apply_additional_features(self, stage: int, t: float) -> None:
         """Translate all bodies and obstacles, and load the unrelated body."""
         d, scene = self.d, self.scene
         self.translation.value[:] = 0.0
         if "translation" in scene:
-            share = (stage + t) / len(scene["stages"]) * self.length
-            self.translation.value[[0, d - 1]] = share * np.array(scene["translation"])
+            distance = (stage + t) / len(scene["stages"]) * self.length
+            self.translation.value[[0, d - 1]] = distance * np.array(scene["translation"])
         for i, value in self._fixed:
             value.value = self.translation.value[i]
         for _, i, value in self.moved:
@@ -325,14 +329,16 @@ class SceneSetup:
             return
         # Its load is a function of the position on the load path.
         unrelated = fuzz_features.UNRELATED_BODIES[scene["unrelated_body"]]
-        share = abs(np.sin(1.3 * (stage + t)))
+        load_factor = abs(np.sin(1.3 * (stage + t)))
         direction, load = np.zeros(d), np.zeros(d)
         direction[[0, d - 1]] = unrelated.get("moved", [0.0, 0.0])
         load[[0, d - 1]] = unrelated.get("load", [0.0, 0.0])
         for i, value in self._unrelated:
-            value.value = share * direction[i] * self.length
+            value.value = load_factor * direction[i] * self.length
         rows = self.traction.x.array.reshape(-1, d)
-        rows[self._cells[self.cell_body == self.n_scene_bodies]] = share * load * self.moduli[-1]
+        rows[self._cells[self.cell_body == self.n_scene_bodies]] = (
+            load_factor * load * self.moduli[-1]
+        )
 
     def loaded_bodies(self) -> list[int]:
         """Return the numbers of the loaded bodies."""
@@ -550,16 +556,17 @@ def _gather_displacement(setup: SceneSetup, u: fem.Function | None = None) -> np
 
 def _record_slip_resets(setup: SceneSetup, contact: fc.Contact) -> None:
     """Record the calls that set a contact's slip reference, or its pairs in an increment."""
-    positions: list[bool] = []  # whether points move with obstacles: then bodies are positioned
+    # Whether points move with obstacles: then bodies are positioned.
+    is_positioning: list[bool] = []
 
     def displaced(by: Any) -> Any:
-        positions[:] = [isinstance(by, ObstacleMotion)]
+        is_positioning[:] = [isinstance(by, ObstacleMotion)]
         return displace(by)
 
-    def count_from_here(points: Array) -> None:
-        (rigid,) = positions
+    def set_slip_reference(points: Array) -> None:
+        (rigid,) = is_positioning
         if rigid and not any(setup.comm.allgather(bool(points.any()))):
-            count(points)  # only other bodies are positioned
+            original_set(points)  # only other bodies are positioned
             return
         unloaded = points & (contact.history.values("normal_traction") == 0.0)
         columns = [contact.points, contact.values.jump, unloaded]
@@ -570,19 +577,20 @@ def _record_slip_resets(setup: SceneSetup, contact: fc.Contact) -> None:
             "jump": rows[:, setup.d : 2 * setup.d],
             "unloaded": rows[:, -1] > 0,
         }
-        count(points)
+        original_set(points)
 
     def start_with_pairs(opposite: Any) -> None:
         setup.paired_at[contact.name] = _gather_displacement(
             setup, opposite.pairs.pairing_displacement
         )
-        begin(opposite)
+        original_start(opposite)
 
-    begin, contact.states.start_with_pairs = contact.states.start_with_pairs, start_with_pairs  # type: ignore[method-assign]
+    original_start = contact.states.start_with_pairs
+    contact.states.start_with_pairs = start_with_pairs  # type: ignore[method-assign]
     displace = contact.contact_kinematics.displaced
     contact.contact_kinematics.displaced = displaced  # type: ignore[method-assign]
-    count = contact.states.set_slip_reference
-    contact.states.set_slip_reference = count_from_here  # type: ignore[method-assign]
+    original_set = contact.states.set_slip_reference
+    contact.states.set_slip_reference = set_slip_reference  # type: ignore[method-assign]
 
 
 def _make_record(

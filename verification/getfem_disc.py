@@ -25,9 +25,9 @@ import numpy as np
 
 E, NU, RADIUS, HEIGHT, DEPTH, STEPS, K = 1000.0, 0.3, 4.0, 10.0, 3.0, 12, 1e4
 KT = 1e3
-MU, TURN, WAY, MORE = 0.3, 0.8, 2.0, 8
+MU, ROTATION, SLIDING_DISTANCE, N_SLIDING = 0.3, 0.8, 2.0, 8
 BOTTOM, TOP, MIDDLE = 1, 2, 3
-AWAY = "((X+u-c)/Norm(X+u-c))"  # from the centre of the disc
+OUTWARD = "((X+u-c)/Norm(X+u-c))"  # from the centre of the disc
 PRESSURE = "(k*neg_part(Norm(X+u-c)-R))"
 
 
@@ -77,7 +77,7 @@ def without_friction() -> int:
     for step in range(1, STEPS + 1):
         model.set_variable("c", [0.0, HEIGHT + RADIUS - DEPTH * step / STEPS])
         iterations += solve(model)
-        force = gf.asm("generic", rule, 0, f"-{PRESSURE}*{AWAY}.[0;1]", TOP, model)
+        force = gf.asm("generic", rule, 0, f"-{PRESSURE}*{OUTWARD}.[0;1]", TOP, model)
         print(f"{DEPTH * step / STEPS:.2f}  {force:.6f}")
     return iterations
 
@@ -87,36 +87,37 @@ def with_friction() -> int:
     model, rule = block(-8.0, 8.0)
     points = gf.MeshImData(rule, TOP)
     across = gf.MeshImData(rule, TOP, 2)
-    model.add_im_data("before", across)  # last projections, as directions from the centre
-    model.add_im_data("borne", points)  # last friction, positive along [-y; x] of these
+    model.add_im_data("previous_projection", across)  # as directions from the centre
+    model.add_im_data("previous_friction", points)  # positive along [-y; x] of these directions
     model.add_initialized_data("mu", [MU])
     model.add_initialized_data("turn", [1.0, 0.0])  # cosine and sine of the last increment's angle
-    along = f"([0,-1;1,0]*{AWAY})"
-    was = "[turn(1)*before(1)-turn(2)*before(2);turn(2)*before(1)+turn(1)*before(2)]"
-    trial = f"(borne-q*R*({along}.(-{was})))"
+    along = f"([0,-1;1,0]*{OUTWARD})"
+    was = "previous_projection"
+    was = f"[turn(1)*{was}(1)-turn(2)*{was}(2);turn(2)*{was}(1)+turn(1)*{was}(2)]"
+    trial = f"(previous_friction-q*R*({along}.(-{was})))"
     bound = f"(mu*{PRESSURE})"
     friction = f"({trial}-pos_part({trial}-{bound})+neg_part({trial}+{bound}))"
     model.add_nonlinear_term(rule, f"-{friction}*({along}.Test_u)", TOP)
 
-    def keep() -> None:
+    def commit() -> None:
         found = model.interpolation(friction, points, TOP)
-        model.set_variable("before", model.interpolation(AWAY, across, TOP))
-        model.set_variable("borne", found)
+        model.set_variable("previous_projection", model.interpolation(OUTWARD, across, TOP))
+        model.set_variable("previous_friction", found)
 
-    model.set_variable("before", model.interpolation(AWAY, across, TOP))
+    model.set_variable("previous_projection", model.interpolation(OUTWARD, across, TOP))
     iterations, done = 0, 0.0
     path = [(0.0, DEPTH * i / STEPS, 0.0) for i in range(1, STEPS + 1)]
-    path += [(0.0, DEPTH, TURN * i / MORE) for i in range(1, MORE + 1)]
-    path += [(WAY * i / MORE, DEPTH, TURN) for i in range(1, MORE + 1)]
+    path += [(0.0, DEPTH, ROTATION * i / N_SLIDING) for i in range(1, N_SLIDING + 1)]
+    path += [(SLIDING_DISTANCE * i / N_SLIDING, DEPTH, ROTATION) for i in range(1, N_SLIDING + 1)]
     for side, depth, angle in path:
         model.set_variable("c", [side, HEIGHT + RADIUS - depth])
         model.set_variable("turn", [np.cos(angle - done), np.sin(angle - done)])
         iterations += solve(model)
-        traction = f"({PRESSURE}*{AWAY}+{friction}*{along})"
-        # The contact force on the block is minus the contact terms of the residual: p along AWAY.
+        traction = f"({PRESSURE}*{OUTWARD}+{friction}*{along})"
+        # The contact force on the block is minus the contact terms of the residual.
         x, y = (gf.asm("generic", rule, 0, f"{traction}({i})", TOP, model) for i in (1, 2))
         torque = gf.asm("generic", rule, 0, f"Norm(X+u-c)*{friction}", TOP, model)
-        keep()
+        commit()
         done = angle
         print(f"({x:.6f}, {y:.6f}, {torque:.6f}),")
     return iterations

@@ -28,8 +28,8 @@ import numpy as np
 
 NU, ROUND, K, KT, MU = 0.3, 0.3, 2e4, 2e4, 0.3
 BLOCKS = (((0.0, 0.0), (6.0, 2.0), (24, 8), 1000.0), ((0.6, 2.0), (2.0, 1.0), (12, 6), 2000.0))
-PRESSED, DRAGGED, DOWN, WAY = 4, 20, 0.2, 1.6
-HELD, CONTACT = 1, 2
+N_INDENTATION, N_SLIDING, INDENTATION, SLIDING_DISTANCE = 4, 20, 0.2, 1.6
+FIXED, CONTACT = 1, 2
 RAY = 0.5  # release distance
 LOWER, UPPER = 0, 1
 
@@ -43,15 +43,15 @@ def block(number: int) -> tuple[gf.Mesh, gf.MeshFem, gf.MeshIm]:
     at, far = 1e-6, 1e3
     low, high = origin[1], origin[1] + size[1]
     ends = [[-far, low - at], [far, low + at]], [[-far, high - at], [far, high + at]]
-    held, contact = ends if number == LOWER else ends[::-1]
-    mesh.set_region(HELD, mesh.outer_faces_in_box(*held))
+    fixed, contact = ends if number == LOWER else ends[::-1]
+    mesh.set_region(FIXED, mesh.outer_faces_in_box(*fixed))
     mesh.set_region(CONTACT, mesh.outer_faces_in_box(*contact))
     if number == UPPER:
-        places = mesh.pts()
+        points = mesh.pts()
         middle = origin[0] + size[0] / 2
-        share = (high - places[1]) / size[1]
-        places[1] += ROUND * share * ((places[0] - middle) / (size[0] / 2)) ** 2
-        mesh.set_pts(places)
+        share = (high - points[1]) / size[1]
+        points[1] += ROUND * share * ((points[0] - middle) / (size[0] / 2)) ** 2
+        mesh.set_pts(points)
     space = gf.MeshFem(mesh, 2)
     space.set_classical_fem(2)
     return mesh, space, gf.MeshIm(mesh, gf.Integ("IM_GAUSS_PARALLELEPIPED(2,4)"))
@@ -68,7 +68,7 @@ def bulk(model: gf.Model, rule: gf.MeshIm, name: str, modulus: float) -> None:
     )
 
 
-class ByPenalty:
+class PenaltyContact:
     """Penalty and friction as expressions in GetFEM's assembly language, with its raytracing."""
 
     def __init__(self, model: gf.Model, blocks: list, mu: float) -> None:
@@ -83,12 +83,12 @@ class ByPenalty:
         model.add_fem_data("w1", space1)
         model.add_fem_data("w2", space2)
         self.points = gf.MeshImData(self.rule, CONTACT)
-        model.add_im_data("borne", self.points)
+        model.add_im_data("previous_friction", self.points)
         n, n0 = (f"Transformed_unit_vector(Grad_{v}1,Normal)" for v in "uw")
         gap = f"((Interpolate(X,ray)+Interpolate(u2,ray)-X-u1).{n})"
         pressure = f"(k*neg_part({gap}))"
-        way = f"(u1-w1-Interpolate(u2,ray)+Interpolate(w2,ray)+{gap}*({n}-{n0}))"
-        trial = f"(borne-q*({way}.([0,-1;1,0]*{n0})))"
+        relative_displacement = f"(u1-w1-Interpolate(u2,ray)+Interpolate(w2,ray)+{gap}*({n}-{n0}))"
+        trial = f"(previous_friction-q*({relative_displacement}.([0,-1;1,0]*{n0})))"
         bound = f"(mu*{pressure})"
         self.friction = f"({trial}-pos_part({trial}-{bound})+neg_part({trial}+{bound}))"
         self.traction = f"(-{pressure}*{n}+{self.friction}*([0,-1;1,0]*{n}))"
@@ -113,18 +113,18 @@ class ByPenalty:
             ]
         )
 
-    def keep(self) -> None:
+    def commit(self) -> None:
         """Commit the present state."""
         model = self.model
         if self.mu:
-            told = f"Interpolate_filter(ray,{self.friction},1)"
-            found = model.interpolation(told, self.points, CONTACT)
-            model.set_variable("borne", found)
+            friction_traction = f"Interpolate_filter(ray,{self.friction},1)"
+            found = model.interpolation(friction_traction, self.points, CONTACT)
+            model.set_variable("previous_friction", found)
         for i in "12":
             model.set_variable("w" + i, model.variable("u" + i))
 
 
-class ByBrick:
+class BrickContact:
     """GetFEM's brick for large sliding, with multipliers on the upper block."""
 
     def __init__(self, model: gf.Model, blocks: list, mu: float) -> None:
@@ -154,7 +154,7 @@ class ByBrick:
             [gf.asm("generic", self.rule, 0, f"m({i})", CONTACT, self.model) for i in (1, 2)]
         )
 
-    def keep(self) -> None:
+    def commit(self) -> None:
         """Commit the present state."""
         for i in "12":
             self.model.set_variable("w" + i, self.model.variable("u" + i))
@@ -173,19 +173,21 @@ def main() -> None:
     ):
         model.add_fem_variable(name, space)
         bulk(model, rule, name, modulus)
-    model.add_initialized_data("led", [0.0, 0.0])
-    model.add_Dirichlet_condition_with_simplification("u2", HELD)
-    model.add_Dirichlet_condition_with_multipliers(blocks[UPPER][2], "u1", 2, HELD, "led")
-    contact = (ByBrick if "--brick" in sys.argv else ByPenalty)(model, blocks, mu)
-    path = [(0.0, DOWN * i / PRESSED) for i in range(1, PRESSED + 1)]
-    path += [(WAY * i / DRAGGED, DOWN) for i in range(1, DRAGGED + 1)]
+    model.add_initialized_data("prescribed_displacement", [0.0, 0.0])
+    model.add_Dirichlet_condition_with_simplification("u2", FIXED)
+    model.add_Dirichlet_condition_with_multipliers(
+        blocks[UPPER][2], "u1", 2, FIXED, "prescribed_displacement"
+    )
+    contact = (BrickContact if "--brick" in sys.argv else PenaltyContact)(model, blocks, mu)
+    path = [(0.0, INDENTATION * i / N_INDENTATION) for i in range(1, N_INDENTATION + 1)]
+    path += [(SLIDING_DISTANCE * i / N_SLIDING, INDENTATION) for i in range(1, N_SLIDING + 1)]
     iterations = []
     for along, down in path:
-        model.set_variable("led", [along, -down])
+        model.set_variable("prescribed_displacement", [along, -down])
         made, _ = model.solve("max_iter", 100, "max_res", 1e-9, "lsearch", "basic")
         iterations.append(int(made))
         found = contact.force()
-        contact.keep()
+        contact.commit()
         print(f"({found[0]:.6f}, {found[1]:.6f}),  # {made}", flush=True)
     spent, waited = time.process_time() - start, time.perf_counter() - clock
     print(f"{sum(iterations)} Newton iterations, {spent:.2f} s of the processor, {waited:.2f} s")

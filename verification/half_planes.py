@@ -21,7 +21,7 @@ GROUND, LOAD, AXIS, SURFACE, OPPOSITE = 1, 2, 3, 4, 5
 @case(
     "Rigid flat punch on a half-plane",
     "0.5 %: half-plane truncated at 50 a; singular pressure at the corner, cells of a/160",
-    budget="the force is given; peak pressure and displacement are infinite",
+    reason_without_estimates="the force is given; peak pressure and displacement are infinite",
 )
 def flat_punch() -> Outcome:
     """Press a flat punch by a force (half modelled); compare pressure and load in |x| ≤ 0.9 a."""

@@ -13,12 +13,12 @@ import basix
 import numpy as np
 from numpy.polynomial import legendre
 
-__all__ = ["Body", "Surface", "find_overlap", "find_pairs", "smooth_modulus"]
+__all__ = ["Body", "Surface", "find_pairs", "integrate_penetration", "smooth_modulus"]
 
 Array = np.ndarray
 # Fraction of a facet that may lack an opposing facet; reference tolerance at the edges of facets.
-_COVERED = 1e-6
-_OVERLAP = 1e-6
+_MAX_UNCOVERED_FRACTION = 1e-6
+_EDGE_TOLERANCE = 1e-6
 
 
 @dataclass(eq=False)
@@ -203,8 +203,8 @@ class Surface:
         x, tangents = self.position(facet, xi, u)
         size = np.linalg.norm(tangents, axis=2).max(axis=1)
         met = ~bad & (np.linalg.norm(x - start - distance[:, None] * ray, axis=1) < 1e-9 * size)
-        met &= np.all(xi >= -_OVERLAP, axis=1)
-        met &= (xi.sum(axis=1) if self.simplex else xi.max(axis=1)) <= 1 + _OVERLAP
+        met &= np.all(xi >= -_EDGE_TOLERANCE, axis=1)
+        met &= (xi.sum(axis=1) if self.simplex else xi.max(axis=1)) <= 1 + _EDGE_TOLERANCE
         return xi, distance, met
 
     def nearest(
@@ -326,7 +326,7 @@ def find_pairs(
     return matrix, gap, paired
 
 
-def find_overlap(surface: Surface, opposite: Surface, u: Array, weight: float) -> float:
+def integrate_penetration(surface: Surface, opposite: Surface, u: Array, weight: float) -> float:
     """Integrate the penetration of a surface into the opposing one along its normals."""
     facet, xi, weights = surface.quadrature(8, "default")
     normal = surface.normal(facet, xi)
@@ -400,7 +400,7 @@ def _cut_quadrature(
                 if twice > 1e-9 * size:
                     points.append(corners[0] + (ring[0] + quadrature @ edges) @ plane.T)
                     weights.append(twice * shares)
-    if abs(covered - 1) > _COVERED or not points:
+    if abs(covered - 1) > _MAX_UNCOVERED_FRACTION or not points:
         return np.zeros((0, slave.d - 1)), np.zeros(0)
     flat = np.concatenate(points)
     xi, _, _ = slave.intersect(np.full(len(flat), f), flat, np.tile(mean, (len(flat), 1)), u)

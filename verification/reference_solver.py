@@ -20,7 +20,7 @@ import scipy.linalg
 from verification.reference_geometry import Body
 from verification.reference_laws import Law, dot
 
-__all__ = ["ContactModel", "Failed", "Load", "Problem", "State"]
+__all__ = ["ContactModel", "Load", "NotSolved", "Problem", "State"]
 
 Array = np.ndarray
 # Step of complex-step derivatives, which have no truncation error.
@@ -64,8 +64,8 @@ class ContactModel:
         free_components: Components of the obstacle's motion that are unknowns.
         projection: L2 projection of the multipliers, (n, n); None without multipliers.
         update_pairs: Updates the pairs for a displacement; None if pairs are fixed.
-        overlap: Integrates the penetration on the opposing surface for a displacement; None on a
-            rigid obstacle.
+        opposite_penetration: Integrates the penetration on the opposing surface for a
+            displacement; None on a rigid obstacle.
         slave: Γc.
         facet: Facet of every point.
         deformed_gap: Returns gap and normal at points (n, d) for an obstacle displacement; None
@@ -87,7 +87,7 @@ class ContactModel:
     free_components: tuple[int, ...] = ()
     projection: Array | None = None
     update_pairs: Any = None
-    overlap: Any = None
+    opposite_penetration: Any = None
     slave: Any = None
     facet: Any = None
     deformed_gap: Any = None
@@ -240,7 +240,7 @@ class Load:
     obstacle_forces: list[Array]
 
 
-class Failed(RuntimeError):
+class NotSolved(RuntimeError):
     """The independent solver has not found a solution."""
 
 
@@ -448,7 +448,7 @@ class Problem:
             u, motions, and the committed states with the multipliers of the solution.
 
         Raises:
-            Failed: The iteration does not converge.
+            NotSolved: The iteration does not converge.
         """
         if all(c.projection is None for c in self.contacts):
             return *self.equilibrate(u, motion, load, old, rtol), old
@@ -461,11 +461,11 @@ class Problem:
             ]
             change, scale = _multiplier_change(new, old)
             old = new
-            if change <= 1e-9 * scale + self.rounding():
+            if change <= 1e-9 * scale + self.traction_roundoff():
                 return u, motion, old
-        raise Failed("multipliers do not converge")
+        raise NotSolved("multipliers do not converge")
 
-    def rounding(self) -> float:
+    def traction_roundoff(self) -> float:
         """Return the round-off of tractions due to the translation of the bodies (stress)."""
         K = max(float((c.k_n + c.k_t).max()) for c in self.contacts)
         return 16 * float(np.finfo(float).eps) * K * self.largest_translation
@@ -476,7 +476,7 @@ class Problem:
         """Solve by Newton's method; if it fails, restart from a sequence of Tresca problems."""
         try:
             return self._newton(u, motion, load, old, rtol)
-        except (Failed, np.linalg.LinAlgError) as failure:
+        except (NotSolved, np.linalg.LinAlgError) as failure:
             if all(c.law.is_unique for c in self.contacts):
                 raise
             last = failure
@@ -490,7 +490,7 @@ class Problem:
             found = self.evaluate(u, motion, load, frozen)
             old_pressures = [-f["r_n"] for f in found]
             if attempt in (2, 5, 10, 24):
-                with contextlib.suppress(Failed):
+                with contextlib.suppress(NotSolved):
                     return self._newton(u, motion, load, old, rtol)
         raise last
 
@@ -583,7 +583,7 @@ class Problem:
         limits = rtol * now.size, 1e-14 * condensed.roundoff(now.z, now.forces)
         excused = max(1e3 * limits[0], 1e2 * limits[1])
         if norm > max(min(excused, 1e-3 * _norm(load.force) or np.inf), *limits):
-            raise Failed(f"residual {norm / max(now.size, 1e-300):.1e} of the forces")
+            raise NotSolved(f"residual {norm / max(now.size, 1e-300):.1e} of the forces")
         u = u.copy()
         u[load.fixed] = load.values
         condensed.recover(u, now.z[:n])

@@ -29,7 +29,7 @@ CASES = cases_of(statics, half_planes, axisymmetric, solids)
 PAGE = ROOT / "docs" / "verification.md"
 FAILED = "FAILED"
 # Errors below this, of statics and exact solutions, are drawn at this value.
-FLOOR = 1e-16
+SMALLEST_DRAWN_ERROR = 1e-16
 Row = dict[str, str]
 
 
@@ -133,7 +133,7 @@ def draw(path: Path, rows: list[Row]) -> None:
     ratios = np.array([_over_tolerance(row) for row in values])
     size = (6.5, 0.26 * len(cases) + 1.0)
     with plotting.figure(path, 2, size=size) as (left, right):
-        left.semilogx(np.maximum(errors, FLOOR), at, "o", markersize=4, alpha=0.6)
+        left.semilogx(np.maximum(errors, SMALLEST_DRAWN_ERROR), at, "o", markersize=4, alpha=0.6)
         left.set_yticks(range(len(cases)), cases, fontsize=7)
         left.set_xlabel("error relative to the reference")
         right.semilogx(np.maximum(ratios, 1e-10), at, "o", markersize=4, alpha=0.6)
@@ -149,7 +149,9 @@ def main() -> int:
     """Solve the cases and write the results; return 0 if all references are met."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", nargs="+", metavar="WORD", help="cases with one of these words")
-    parser.add_argument("--output", type=Path, help="page to write, with a CSV file beside it")
+    parser.add_argument(
+        "--output", type=Path, help="page to write; the CSV file is written to the same directory"
+    )
     parser.add_argument("--page", action="store_true", help="only write the page of stored values")
     arguments = parser.parse_args()
     path = arguments.output or PAGE

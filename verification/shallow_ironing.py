@@ -48,7 +48,7 @@ COLUMNS = ("name", *(field.name for field in fields(Setting)), *RESULTS)
 BASE = Setting(until=2.0)
 
 
-def sized(size: float, increments: int, until: float = 1.6) -> Setting:
+def setting_on_mesh(size: float, increments: int, until: float = 1.6) -> Setting:
     """Return the base run on another mesh: equal stiffness, increments of a fifth of a facet."""
     stiffness = BASE.stiffness * size / BASE.size
     return replace(BASE, size=size, increments=increments, until=until, stiffness=stiffness)
@@ -59,16 +59,16 @@ def settings() -> dict[str, Setting]:
 
     Some variants are on the mesh of the base run, most others on a mesh coarser by a factor of √2.
     """
-    short, coarse = replace(BASE, until=1.6), sized(0.283, 180)
+    short, coarse = replace(BASE, until=1.6), setting_on_mesh(0.283, 180)
     runs = {
         "base": BASE,
         "isochoric": replace(short, isochoric=True),
         "height 3": replace(short, height=3.0),
         "isochoric, height 3": replace(short, isochoric=True, height=3.0),
-        "size 0.4": sized(0.4, 126),
+        "size 0.4": setting_on_mesh(0.4, 126),
         "size 0.283": coarse,
-        "size 0.141": sized(0.141, 360),
-        "size 0.1": sized(0.1, 500),
+        "size 0.141": setting_on_mesh(0.141, 360),
+        "size 0.1": setting_on_mesh(0.1, 500),
     }
     varied = {
         "augmented": replace(coarse, enforcement="augmented"),
@@ -84,7 +84,10 @@ def settings() -> dict[str, Setting]:
         "die 100 times stiffer": replace(coarse, die=100 * BASE.die),
     }
     runs |= {f"{name}, size 0.283": setting for name, setting in varied.items()}
-    degrees = {"degree 1, size 0.141": (1, sized(0.141, 360)), "degree 3, size 0.283": (3, coarse)}
+    degrees = {
+        "degree 1, size 0.141": (1, setting_on_mesh(0.141, 360)),
+        "degree 3, size 0.283": (3, coarse),
+    }
     return runs | {name: replace(made, degree=degree) for name, (degree, made) in degrees.items()}
 
 
@@ -124,7 +127,7 @@ def run(setting: Setting) -> tuple[dict[str, Any], list[tuple[float, float, floa
     return row, [(row["time"], row["V"], row["H"]) for row in path]
 
 
-def started(name: str) -> tuple[dict[str, Any], list[tuple[float, float, float]]]:
+def start_process(name: str) -> tuple[dict[str, Any], list[tuple[float, float, float]]]:
     """Run in a separate process; return a row with the failure if it does not end normally."""
     words = command(1, Path(__file__), "--one", name)
     try:
@@ -153,7 +156,7 @@ def append(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]]) ->
         os.fsync(file.fileno())
 
 
-def stored(path: Path) -> list[dict[str, str]]:
+def read_rows(path: Path) -> list[dict[str, str]]:
     """Return the rows of a file, or no rows if it does not exist."""
     return report.read(path) if path.exists() else []
 
@@ -162,7 +165,7 @@ def results() -> dict[str, dict[str, float]]:
     """Return the results by name of the run and of the quantity, without failed runs."""
     return {
         row["name"]: {name: float(row[name]) for name in RESULTS[:-1] if row[name]}
-        for row in stored(STUDY)
+        for row in read_rows(STUDY)
         if not row["failure"]
     }
 
@@ -170,18 +173,18 @@ def results() -> dict[str, dict[str, float]]:
 def curves() -> dict[str, np.ndarray]:
     """Return t, V and H of all increments, shape (n, 3), by name of the run."""
     found: dict[str, list[list[float]]] = {}
-    for row in stored(CURVES):
+    for row in read_rows(CURVES):
         found.setdefault(row["name"], []).append([float(row[name]) for name in ("t", "V", "H")])
     return {name: np.array(points) for name, points in found.items()}
 
 
 def study(names: Sequence[str], jobs: int) -> None:
     """Compute and store the missing runs among ``names``, ``jobs`` at a time."""
-    done = {row["name"] for row in stored(STUDY)}
+    done = {row["name"] for row in read_rows(STUDY)}
     lock = Lock()
 
     def make(name: str) -> None:
-        row, curve = started(name)
+        row, curve = start_process(name)
         full = {"name": name} | asdict(settings()[name]) | row
         with lock:
             if curve:

@@ -41,7 +41,7 @@ VARIANTS = (
     f"die 100 times stiffer{COARSE}",
 )
 # Safety factors with and without an observed convergence order.
-SAFE, UNSAFE = 1.25, 3.0
+SAFETY_FACTOR_ORDER, SAFETY_FACTOR_NO_ORDER = 1.25, 3.0
 ORDERS = np.linspace(0.5, 4.0, 701)
 
 
@@ -76,8 +76,8 @@ def richardson(sizes: Sequence[float], values: Sequence[float]) -> Limit:
         best = int(np.argmin([miss for _, miss in fits]))
         if 0 < best < len(ORDERS) - 1:
             value, miss = fits[best]
-            return Limit(value, ORDERS[best], SAFE * abs(value - f[-1]) + miss)
-    return Limit(f[-1], np.nan, UNSAFE * float(np.ptp(f)) / (h.max() / h.min() - 1))
+            return Limit(value, ORDERS[best], SAFETY_FACTOR_ORDER * abs(value - f[-1]) + miss)
+    return Limit(f[-1], np.nan, SAFETY_FACTOR_NO_ORDER * float(np.ptp(f)) / (h.max() / h.min() - 1))
 
 
 def _fit(h: np.ndarray, f: np.ndarray, order: float) -> tuple[float, float]:
@@ -87,7 +87,7 @@ def _fit(h: np.ndarray, f: np.ndarray, order: float) -> tuple[float, float]:
     return float(solution[0]), float(np.abs(terms @ solution - f).max())
 
 
-def meshes(rows: Rows, quantity: str) -> Limit:
+def mesh_limit(rows: Rows, quantity: str) -> Limit:
     """Return the mesh limit of a quantity, from the runs that have a value of it."""
     key = QUANTITIES[quantity]
     found = [(size, rows[name][key]) for name, size in MESHES.items() if key in rows[name]]
@@ -109,7 +109,7 @@ def differences(rows: Rows, quantity: str) -> dict[str, float]:
 def contributions(rows: Rows, quantity: str) -> dict[str, float]:
     """Return the contributions to the error of a quantity, by source [N/mm]."""
     moved = differences(rows, quantity)
-    mesh = meshes(rows, quantity)
+    mesh = mesh_limit(rows, quantity)
     pressing = quantity == "V(1)"
     steps = "80 increments of pressing" if pressing else "360 increments of sliding"
     # The penalty error is proportional to 1/k: half of the difference between k/3 and k.
@@ -124,9 +124,9 @@ def contributions(rows: Rows, quantity: str) -> dict[str, float]:
     }
 
 
-def converged(rows: Rows, quantity: str) -> tuple[float, float]:
+def converged_value(rows: Rows, quantity: str) -> tuple[float, float]:
     """Return a quantity and its error [N/mm]: limit of the meshes, corrected for the penalty."""
-    mesh = meshes(rows, quantity)
+    mesh = mesh_limit(rows, quantity)
     value = mesh.value + differences(rows, quantity)[f"augmented{COARSE}"]
     return value, sum(contributions(rows, quantity).values())
 
@@ -144,7 +144,7 @@ def page(rows: Rows) -> str:
         "This page gives a converged solution with its error; t = 1 is the end of pressing, "
         "t = 1.5 half of the sliding distance."
     )
-    lines += answers(rows)
+    lines += value_table(rows)
     lines += ["![Vertical and horizontal force over time](shallow-ironing.png)", ""]
     lines += report.text(
         "*Converged forces with their error (grey), variants of the problem, and published values, "
@@ -162,7 +162,7 @@ def page(rows: Rows) -> str:
         "that of the finest mesh and the error 3 times the range of all values, divided by "
         "(largest size / smallest size - 1).",
     )
-    lines += ["## Error", "", *budget(rows)]
+    lines += ["## Error", "", *error_table(rows)]
     lines += report.text(
         "The sum assumes that all contributions have the same sign. Enforcement: difference "
         "between the augmented Lagrangian and the extrapolation of two penalty stiffnesses in 1/k. "
@@ -201,14 +201,14 @@ def page(rows: Rows) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def short(name: str) -> str:
+def short_name(name: str) -> str:
     """Return the name of a run without its mesh."""
     return name.removesuffix(COARSE)
 
 
-def answers(rows: Rows) -> list[str]:
+def value_table(rows: Rows) -> list[str]:
     """Return the table of converged values, variants and published values."""
-    found = [converged(rows, quantity) for quantity in QUANTITIES]
+    found = [converged_value(rows, quantity) for quantity in QUANTITIES]
     values = [value for value, _ in found]
     bars = [f"**{value:.1f} ± {error:.1f}**" for value, error in found]
     body = [["converged", *bars, f"**{values[2] / values[1]:.3f}**"]]
@@ -217,14 +217,14 @@ def answers(rows: Rows) -> list[str]:
             value + differences(rows, q)[name] for q, value in zip(QUANTITIES, values, strict=True)
         ]
         body.append(
-            [short(name), *(f"{value:.1f}" for value in moved), f"{moved[2] / moved[1]:.3f}"]
+            [short_name(name), *(f"{value:.1f}" for value in moved), f"{moved[2] / moved[1]:.3f}"]
         )
     for name, points in PUBLISHED.items():
         body.append([name, *(f"{value:.0f}" for value in points), f"{points[2] / points[1]:.2f}"])
     return report.table(("N/mm", *QUANTITIES, "H/V at 1.5"), body)
 
 
-def budget(rows: Rows) -> list[str]:
+def error_table(rows: Rows) -> list[str]:
     """Return the table of contributions to the error."""
     parts = [contributions(rows, quantity) for quantity in QUANTITIES]
     body = [[name, *(f"{one[name]:.2f}" for one in parts)] for name in parts[0]]
@@ -235,7 +235,7 @@ def budget(rows: Rows) -> list[str]:
 # ---- figures -------------------------------------------------------------------------------------
 
 
-def corrected(
+def scale_curve(
     rows: Rows, name: str, t: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the curve of the base run, V or H, scaled to the limit, and its error.
@@ -245,7 +245,7 @@ def corrected(
     """
     scales, bars = [], []
     for quantity in ("V(1)", f"{name}(1.5)"):
-        value, error = converged(rows, quantity)
+        value, error = converged_value(rows, quantity)
         scales.append(value / rows["base"][QUANTITIES[quantity]])
         bars.append(error / value)
     limit = values * np.interp(t, (1.0, 1.5), scales)
@@ -263,12 +263,12 @@ def draw(file: Path, rows: Rows, curves: Mapping[str, np.ndarray]) -> None:
     with plotting.figure(file, 2, (6.8, 5.2)) as axes:
         for ax, name, column in zip(axes, "VH", (1, 2), strict=True):
             t = curves["base"][:, 0]
-            limit, bar = corrected(rows, name, t, curves["base"][:, column])
+            limit, bar = scale_curve(rows, name, t, curves["base"][:, column])
             ax.fill_between(t, limit - bar, limit + bar, color="k", alpha=0.25, lw=0)
             ax.plot(t, limit, "k", lw=1.5, label="converged, with error")
             for i, each in enumerate(VARIANTS):
                 points = curves[each]
-                ax.plot(points[:, 0], points[:, column], f"C{i}", lw=1, label=short(each))
+                ax.plot(points[:, 0], points[:, column], f"C{i}", lw=1, label=short_name(each))
             for marker, (program, values) in zip("osD^v", PUBLISHED.items(), strict=True):
                 at, shown = ((1.0, 1.5), values[:2]) if name == "V" else ((1.5,), values[2:])
                 style = {"ms": 8, "mec": "k", "mfc": "w", "ls": "", "zorder": 5}
@@ -286,7 +286,7 @@ def draw_changes(file: Path, rows: Rows) -> None:
     names = [name for name in rows if name not in ("base", *VARIANTS)]
     with plotting.figure(file, size=(9.0, 5.0)) as axes:
         for i, (quantity, marker) in enumerate(zip(QUANTITIES, "osv", strict=True)):
-            value, error = converged(rows, quantity)
+            value, error = converged_value(rows, quantity)
             at = [n for n, name in enumerate(names) if name in moved[quantity]]
             changes = [100 * moved[quantity][names[n]] / value for n in at]
             axes.plot(changes, at, marker, color=f"C{i}", markersize=5, label=quantity)

@@ -17,19 +17,25 @@ import numpy as np
 import scipy.spatial
 from mpi4py import MPI
 
-from verification import finite_reference, fuzz_judge, fuzz_reference, fuzz_setup, sliding_scenes
+from verification import (
+    finite_reference,
+    fuzz_comparison,
+    fuzz_reference,
+    fuzz_setup,
+    sliding_scenes,
+)
 from verification import reference_solver as reference
 
-__all__ = ["SlidingContact", "SlidingJudge", "SlidingProblem", "make_problem"]
+__all__ = ["SlidingComparison", "SlidingContact", "SlidingProblem", "make_problem"]
 
 Array = np.ndarray
 
 # Step of finite differences relative to the mesh size.
 _DIFFERENCE = 1e-7
 # Numbers of parts into which an increment is divided, in the order of attempts.
-_PARTS = (1, 8)
+_SLIDING_SUBDIVISIONS = (1, 8)
 # Relative round-off of positions, whose differences are gaps and strains.
-_PLACES = 100 * np.finfo(float).eps
+_COORDINATE_ROUND_OFF = 100 * np.finfo(float).eps
 
 
 @dataclass(eq=False)
@@ -87,12 +93,12 @@ class SlidingContact(reference.ContactModel):
             angle = np.arctan2(s, c)
             c, s = np.cos(angle), np.sin(angle)
             return n_new, np.stack([np.stack([c, -s], 1), np.stack([s, c], 1)], 1), n_old
-        turn = gradient
+        rotation = gradient
         for _ in range(8):  # Newton's iteration for the polar decomposition
-            turn = 0.5 * (turn + np.swapaxes(np.linalg.inv(turn), 1, 2))
-        return n_new, turn, n_old
+            rotation = 0.5 * (rotation + np.swapaxes(np.linalg.inv(rotation), 1, 2))
+        return n_new, rotation, n_old
 
-    def partners(self, u: Array, old: SlidingState) -> Array:
+    def find_opposing_facets(self, u: Array, old: SlidingState) -> Array:
         """Return the number of the opposing facet of every point; -1 without one."""
         depth = np.zeros(len(self.slave.facets))
         if old.depth is not None:
@@ -102,74 +108,87 @@ class SlidingContact(reference.ContactModel):
         count, m = len(x), len(self.master.facets)
         every = np.tile(np.arange(m), count)
         rows = np.repeat(np.arange(count), m)
-        xi, far, met = self.master.intersect(every, x[rows], n[rows], u)
-        met &= np.sum(self.master.deformed_normal(every, xi, u) * n[rows], axis=1) < 0
+        xi, far, is_met = self.master.intersect(every, x[rows], n[rows], u)
+        is_met &= np.sum(self.master.deformed_normal(every, xi, u) * n[rows], axis=1) < 0
         max_distance = np.maximum(
             self.max_distance[self.facet[rows], every], 2 * depth[self.facet[rows]]
         )
-        met &= far >= -max_distance
-        distance = np.where(met, np.abs(far), np.inf).reshape(count, m)
+        is_met &= far >= -max_distance
+        distance = np.where(is_met, np.abs(far), np.inf).reshape(count, m)
         best = distance.argmin(axis=1)
         return np.where(np.isfinite(distance[np.arange(count), best]), best, -1)
 
     def evaluate_at(self, u: Array, old: Any) -> dict[str, Array]:
         """Return tractions and local kinematics at a displacement."""
-        hit = self.partners(u, old)
-        own, other = self.slave.local(self.facet, u), self.master.local(np.maximum(hit, 0), u)
-        return self._evaluate(np.arange(len(hit)), hit, own, other, old) | {"u": u}
+        opposing_facets = self.find_opposing_facets(u, old)
+        own, other = (
+            self.slave.local(self.facet, u),
+            self.master.local(np.maximum(opposing_facets, 0), u),
+        )
+        return self._evaluate(np.arange(len(opposing_facets)), opposing_facets, own, other, old) | {
+            "u": u
+        }
 
     def _evaluate(
-        self, rows: Array, hit: Array, own: Array, other: Array, old: Any
+        self, rows: Array, opposing_facets: Array, own: Array, other: Array, old: Any
     ) -> dict[str, Array]:
         """Evaluate a subset of points, given the nodal displacements of the cells on both sides."""
         law, facet, xi = self.law, self.facet[rows], self.xi[rows]
         own_before = self.slave.local(facet, old.u)
-        n, turn, n_old = self.rotation(own, own_before, rows)
-        met, partner = hit >= 0, np.maximum(hit, 0)
+        n, rotation, n_old = self.rotation(own, own_before, rows)
+        paired, partner = opposing_facets >= 0, np.maximum(opposing_facets, 0)
         x, _ = self.slave.position(facet, xi, own)
         at, gap = np.zeros((len(rows), self.d - 1)), np.zeros(len(rows))
-        at[met], gap[met], _ = self.master.intersect(hit[met], x[met], n[met], other[met])
+        at[paired], gap[paired], _ = self.master.intersect(
+            opposing_facets[paired], x[paired], n[paired], other[paired]
+        )
         old_position, _ = self.master.position(partner, at, old.u)
         old_ray_end = self.slave.position(facet, xi, own_before)[0] + gap[:, None] * n_old
-        slip = np.where(met[:, None], old_position - old_ray_end, 0.0)
+        slip = np.where(paired[:, None], old_position - old_ray_end, 0.0)
 
-        def across(vector: Array) -> Array:
+        def project_tangentially(vector: Array) -> Array:
             return vector - np.sum(vector * n, axis=1)[:, None] * n
 
-        def ahead(vector: Array) -> Array:
-            return across(np.einsum("qij,qj->qi", turn, vector))
+        def push_forward(vector: Array) -> Array:
+            return project_tangentially(np.einsum("qij,qj->qi", rotation, vector))
 
-        step, before = ahead(slip - old.jump[rows]), ahead(old.traction[rows])
+        step, before = push_forward(slip - old.jump[rows]), push_forward(old.traction[rows])
         pressure = None if old.pressure is None else old.pressure[rows]
         r_n = law.normal_traction(self.k_n[rows], -gap, pressure)
         tau = law.tangential_traction(self.k_t[rows], n, step, before, step, r_n, -gap, None)
-        r_n, tau = np.where(met, r_n, 0.0), np.where(met[:, None], tau, 0.0)
+        r_n, tau = np.where(paired, r_n, 0.0), np.where(paired[:, None], tau, 0.0)
         found = {"normal": n, "overclosure": -gap, "relative": slip, "slip": step}
-        found |= {"tau_old": before, "pairs": hit, "slave_u": own, "master_u": other}
-        found |= {"r_n": r_n, "tau": tau, "traction": r_n[:, None] * n + tau, "turn": turn}
-        found |= {"tau_local": np.einsum("qji,qj->qi", turn, tau)}
+        found |= {"tau_old": before, "pairs": opposing_facets, "slave_u": own, "master_u": other}
+        found |= {"r_n": r_n, "tau": tau, "traction": r_n[:, None] * n + tau, "rotation": rotation}
+        found |= {"tau_local": np.einsum("qji,qj->qi", rotation, tau)}
         weights = self.weights[rows, None]
-        shares = weights * self.slave.shapes(facet, xi), -weights * self.master.shapes(partner, at)
-        return found | {"shapes": shares}
+        nodal_weights = (
+            weights * self.slave.shapes(facet, xi),
+            -weights * self.master.shapes(partner, at),
+        )
+        return found | {"nodal_weights": nodal_weights}
 
-    def _nodes(self, hit: Array) -> tuple[Array, Array]:
+    def _nodes(self, opposing_facets: Array) -> tuple[Array, Array]:
         """Return the nodes of the cells of every point on both sides, (n, m) each."""
         slave, master = self.slave, self.master
-        partner = np.maximum(hit, 0)
+        partner = np.maximum(opposing_facets, 0)
         return slave.body.nodes[slave.cells[self.facet]], master.body.nodes[master.cells[partner]]
 
     def force(self, found: dict[str, Array]) -> Array:
         """Return the force on the nodes of both bodies, (N,)."""
         total = np.zeros((self.interpolation.shape[1], self.d))
-        for nodes, share in zip(self._nodes(found["pairs"]), found["shapes"], strict=True):
+        for nodes, share in zip(self._nodes(found["pairs"]), found["nodal_weights"], strict=True):
             np.add.at(total, nodes, share[:, :, None] * found["traction"][:, None, :])
         return total.ravel()
 
     def tangent(self, found: dict[str, Array], old: Any, h: float) -> Array:
         """Return the derivative of `force` by finite differences, (N, N)."""
-        hit, d = found["pairs"], self.d
-        n, k = len(hit), found["slave_u"].shape[1] * d
-        dofs = [(d * nodes[:, :, None] + np.arange(d)).reshape(n, k) for nodes in self._nodes(hit)]
+        opposing_facets, d = found["pairs"], self.d
+        n, k = len(opposing_facets), found["slave_u"].shape[1] * d
+        dofs = [
+            (d * nodes[:, :, None] + np.arange(d)).reshape(n, k)
+            for nodes in self._nodes(opposing_facets)
+        ]
         dofs = np.concatenate(dofs, axis=1)
         rows, which = (
             g.ravel() for g in np.meshgrid(np.arange(n), np.arange(2 * k), indexing="ij")
@@ -178,22 +197,22 @@ class SlidingContact(reference.ContactModel):
         for step in (h, -h):
             local = np.stack([found["slave_u"][rows], found["master_u"][rows]], axis=1)
             local.reshape(len(rows), 2 * k)[np.arange(len(rows)), which] += step
-            moved = self._evaluate(rows, hit[rows], local[:, 0], local[:, 1], old)
-            forces = [s[:, :, None] * moved["traction"][:, None, :] for s in moved["shapes"]]
+            moved = self._evaluate(rows, opposing_facets[rows], local[:, 0], local[:, 1], old)
+            forces = [s[:, :, None] * moved["traction"][:, None, :] for s in moved["nodal_weights"]]
             ends.append(np.stack(forces, axis=1).reshape(n, 2 * k, 2 * k))
         change = np.swapaxes(ends[0] - ends[1], 1, 2) / (2 * h)
         matrix = np.zeros((self.interpolation.shape[1] * d,) * 2)
         np.add.at(matrix, (dofs[:, :, None], dofs[:, None, :]), change)
         return matrix
 
-    def tied_stiffness(self, found: dict[str, Array]) -> Array:
+    def bonded_stiffness(self, found: dict[str, Array]) -> Array:
         """Return the stiffness of springs that bond all points to the opposing body, (N, N)."""
-        across = np.zeros((len(self.x), self.interpolation.shape[1]))
+        interpolation = np.zeros((len(self.x), self.interpolation.shape[1]))
         rows = np.arange(len(self.x))[:, None]
-        for nodes, share in zip(self._nodes(found["pairs"]), found["shapes"], strict=True):
-            np.add.at(across, (rows, nodes), share)
+        for nodes, share in zip(self._nodes(found["pairs"]), found["nodal_weights"], strict=True):
+            np.add.at(interpolation, (rows, nodes), share)
         stiff = np.maximum(self.k_n, self.k_t) / self.weights
-        return np.kron(across.T @ (stiff[:, None] * across), np.eye(self.d))
+        return np.kron(interpolation.T @ (stiff[:, None] * interpolation), np.eye(self.d))
 
     def augment(self, found: dict[str, Array], old: Any) -> SlidingState:
         """Return the state after one augmentation."""
@@ -212,7 +231,7 @@ class SlidingContact(reference.ContactModel):
             left = -self.law.elastic_slip(
                 self.k_t, found["normal"], found["tau_old"] - found["tau"]
             )
-        traction = np.einsum("qij,qj->qi", found["turn"], old.traction)
+        traction = np.einsum("qij,qj->qi", found["rotation"], old.traction)
         return SlidingState(left, traction, old.pressure, None, u, depth)
 
 
@@ -238,7 +257,9 @@ class SlidingProblem(finite_reference.FiniteProblem):
         h = _DIFFERENCE * np.ptp(self.body.nodes_x, axis=0).max()
         for c, o in zip(self.contacts, old, strict=True):
             found = c.evaluate_at(v, o)
-            matrix = matrix + c.tied_stiffness(found) if stick else matrix - c.tangent(found, o, h)
+            matrix = (
+                matrix + c.bonded_stiffness(found) if stick else matrix - c.tangent(found, o, h)
+            )
         return matrix[np.ix_(free_dofs, free_dofs)]
 
 
@@ -258,7 +279,11 @@ def make_problem(scene: dict[str, Any]) -> tuple[SlidingProblem, Any, Callable[[
         contacts.append(found)
     loads = finite_reference.make_loads(setup)
     bulk = finite_reference.make_bulk(setup, body)
-    return SlidingProblem(body, contacts, bulk=bulk, subdivisions=_PARTS), setup, loads
+    return (
+        SlidingProblem(body, contacts, bulk=bulk, subdivisions=_SLIDING_SUBDIVISIONS),
+        setup,
+        loads,
+    )
 
 
 def _body_sides(scene: dict[str, Any], body: int, surface: Any) -> list[Any]:
@@ -266,7 +291,7 @@ def _body_sides(scene: dict[str, Any], body: int, surface: Any) -> list[Any]:
     return [surface(fuzz_setup.tag_of(scene, body, side)) for side in sides]
 
 
-class SlidingJudge(finite_reference.FiniteJudge):
+class SlidingComparison(finite_reference.FiniteComparison):
     """Compares the package's increments of two sliding bodies, whose solutions are not unique."""
 
     @staticmethod
@@ -304,7 +329,9 @@ class SlidingJudge(finite_reference.FiniteJudge):
         before = [] if self._before is None else self._before["bodies"]
         most = max(body["rounding"] for body in [*forces["bodies"], *before])
         nodes_x = np.abs(self.problem.body.nodes_x.ravel()) + np.abs(u)
-        most += _PLACES * float(np.linalg.norm(np.diag(self.problem.stiffness(u)) * nodes_x))
+        most += _COORDINATE_ROUND_OFF * float(
+            np.linalg.norm(np.diag(self.problem.stiffness(u)) * nodes_x)
+        )
         for body in forces["bodies"]:
             body["rounding"] = most
         return forces
@@ -316,23 +343,26 @@ class SlidingJudge(finite_reference.FiniteJudge):
                 continue
             overclosure = max(float(np.max(f["overclosure"][f["pairs"] >= 0], initial=0.0)), 0.0)
             size = max(float(c.slave.lengths().max()), self._curvature_height)
-            loops = [self._spline_gap(sides, u) for sides in c.outlines]
+            loops = [self._outline_points(sides, u) for sides in c.outlines]
             for own, (surface, opposite) in enumerate(((c.slave, c.master), (c.master, c.slave))):
-                x = fuzz_judge.sample_surface(surface, u)[0]
+                x = fuzz_comparison.sample_surface(surface, u)[0]
                 inside = matplotlib.path.Path(loops[1 - own]).contains_points(x)
-                wall = scipy.spatial.cKDTree(fuzz_judge.sample_surface(opposite, u, 65)[0])
+                wall = scipy.spatial.cKDTree(fuzz_comparison.sample_surface(opposite, u, 65)[0])
                 depth = np.where(inside, wall.query(x)[0], 0.0).max()
                 value = depth - overclosure
                 self._check(
-                    f"{name}, contact {i}", "penetration", value, fuzz_judge.MAX_PENETRATION * size
+                    f"{name}, contact {i}",
+                    "penetration",
+                    value,
+                    fuzz_comparison.MAX_PENETRATION * size,
                 )
 
     @staticmethod
-    def _spline_gap(sides: list[Any], u: Array) -> Array:
+    def _outline_points(sides: list[Any], u: Array) -> Array:
         """Return the outline of a body as points, anticlockwise from its lower left corner."""
         rows = []
         for k, side in enumerate(sides):
-            x, start, _ = fuzz_judge.sample_surface(side, u)
+            x, start, _ = fuzz_comparison.sample_surface(side, u)
             order = np.argsort(start[:, k % 2])
             rows.append(x[order[::-1] if k > 1 else order])
         return np.concatenate(rows)

@@ -17,7 +17,7 @@ from verification.finite_scenes import FiniteSetup
 from verification.fuzz_scenes import Scene, draw_element, draw_form, make_samplers
 from verification.fuzz_setup import SceneSetup
 
-__all__ = ["SlidingSetup", "draw", "turn"]
+__all__ = ["SlidingSetup", "draw", "rotation_matrix"]
 
 Array = np.ndarray
 
@@ -59,9 +59,9 @@ def draw(
     size[-1] = within(0.6, 1.2)
     slab = {"origin": [0.0] * d, "size": size, "n": [counts[0]] * (d - 1) + [2]}
     width = within(0.25, 0.6) * size[0]
-    room = size[0] - width
+    free_width = size[0] - width
     block = {"origin": [0.0] * d, "size": [width] * d, "n": [counts[1]] * (d - 1) + [2]}
-    block["origin"] = [within(0.1, 0.9) * room] + [0.5 * (s - width) for s in size[1:]]
+    block["origin"] = [within(0.1, 0.9) * free_width] + [0.5 * (s - width) for s in size[1:]]
     clearance = within(-0.2, 1.0) * strain * width if chance(0.3, of=rng) else 0.0
     block["origin"][-1] = float(f"{size[-1] + clearance:.6g}")
     stiff = log(0, 3.5) if chance(0.3, "stiff", of=rng) else log(-0.5, 0.5)
@@ -180,19 +180,19 @@ def _make_dissimilar(scene: Scene, rng: np.random.Generator) -> None:
     widths is 10 for degree 2, and 4 in 3D.
     """
     slab, block = scene["bodies"]
-    wide, room = block["size"], slab["size"][0]
-    wide[0] = float(f"{rng.uniform(0.6, 0.9) * room:.3g}")
-    block["origin"][0] = float(f"{rng.uniform(0.0, 1.0) * (room - wide[0]):.3g}")
+    block_size, slab_width = block["size"], slab["size"][0]
+    block_size[0] = float(f"{rng.uniform(0.6, 0.9) * slab_width:.3g}")
+    block["origin"][0] = float(f"{rng.uniform(0.0, 1.0) * (slab_width - block_size[0]):.3g}")
     fine, coarse = (slab, block) if rng.random() < 0.5 else (block, slab)
-    most = 4 if len(wide) == 3 else 20 / scene["degree"]
+    most = 4 if len(block_size) == 3 else 20 / scene["degree"]
     ratio = most ** rng.uniform(0.5, 1.0)
     for body, n in ((coarse, 1), (fine, round(ratio * fine["size"][0] / coarse["size"][0]))):
-        body["n"][:-1] = [max(n, 1)] * (len(wide) - 1)
+        body["n"][:-1] = [max(n, 1)] * (len(block_size) - 1)
     soft, stiff = (slab, block) if rng.random() < 0.5 else (block, slab)
     soft["E"], stiff["E"] = 100.0, float(f"{100 * 10 ** rng.uniform(3.0, 6.0):.3g}")
 
 
-def turn(d: int, angle: float) -> Array:
+def rotation_matrix(d: int, angle: float) -> Array:
     """Return the matrix of a rotation in the plane of the first and the last axis."""
     c, s = np.cos(angle), np.sin(angle)
     found = np.eye(d)
@@ -232,14 +232,14 @@ class SlidingSetup(FiniteSetup):
             rows[self._cells] = -down * min(self.moduli[: self.n_scene_bodies]) * np.eye(d)[-1]
             for _, i, value in self.moved:
                 value.value = direction[i] * self.length
-            self.apply_features(stage, t)
+            self.apply_additional_features(stage, t)
             return
         direction[-1] = -down * block["size"][-1]
         middle = 0.5 * np.array(slab["size"]) * self.length
         pivot = (np.array(block["origin"]) + 0.5 * np.array(block["size"])) * self.length
-        whole, own = turn(d, now["spin"]), turn(d, now["turn"])
+        whole, own = rotation_matrix(d, now["spin"]), rotation_matrix(d, now["turn"])
         x = self.V.tabulate_dof_coordinates()[:, :d]
-        self.apply_features(stage, t)
+        self.apply_additional_features(stage, t)
         for body, value in self._moved_bodies:
             place = x
             if body == 1:

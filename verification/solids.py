@@ -16,7 +16,8 @@ GROUND, TOP, AXIS, SURFACE, OPPOSITE = 1, 2, 3, 4, 5
     "Two spheres, normal then tangential load (Cattaneo, Mindlin)",
     "2 %: quadrature points are a/15 apart; half-spaces truncated at 6 a",
     slow=True,
-    budget="truncation of the half-spaces at 6 a changes the reference by 1 %, more than the error",
+    reason_without_estimates="truncation of the half-spaces at 6 a changes the reference by "
+    "1 %, more than the error",
 )
 def spheres() -> Outcome:
     """Solve two spheres as two blocks of equal material with the gap r²/2R; y ≥ 0 is modelled.

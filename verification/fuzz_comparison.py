@@ -18,46 +18,46 @@ import scipy.spatial.distance
 from verification import fuzz_reference, fuzz_scenes
 from verification import reference_solver as reference
 
-__all__ = ["MAX_PENETRATION", "Judge", "sample_surface"]
+__all__ = ["MAX_PENETRATION", "Comparison", "sample_surface"]
 
 Array = np.ndarray
 
 # Residual relative to the solver's tolerance. SNES stops below 1, the verdict accepts 2; here
 # norms are those of single bodies.
-_RESIDUAL = 30.0
+_RESIDUAL_RATIO = 30.0
 # Round-off of a displacement increment, relative to the previous displacement.
-_STEPPED = 16 * np.finfo(float).eps
+_DISPLACEMENT_ROUND_OFF = 16 * np.finfo(float).eps
 # Round-off of K u.
-_ROUNDING = 1000 * np.finfo(float).eps
+_RESIDUAL_ROUND_OFF = 1000 * np.finfo(float).eps
 # Relative difference of sums over the quadrature points for the same u.
-_SUMS = 1e-9
+_SUM_TOLERANCE = 1e-9
 # Relative difference of integrals between curved facets, divided by the square of their slope.
 # Measured: 3 for bodies bent by 2e-6 to 2e-4.
-_CURVED = 5.0
+_CURVED_INTEGRATION_ERROR = 5.0
 # Relative difference of the smoothed E/h on distorted quadrilaterals with rational integrands.
 # Measured: 1.4e-8 of the pressure.
-_SMOOTHED, _K = 1e-7, ("k_n", "k_t")
+_SMOOTHED_MODULUS_ERROR, _STIFFNESS_NAMES = 1e-7, ("k_n", "k_t")
 # Largest penetration with multipliers, relative to the size of Γc.
-_PENETRATION = 1e-2
+_MULTIPLIER_PENETRATION = 1e-2
 # Error of initial positioning relative to the size of the bodies, and its round-off.
-_POSITION, _ROUND_OFF = 1e-6, 1e-13
+_POSITION_TOLERANCE, _POSITION_ROUND_OFF = 1e-6, 1e-13
 # Penetration between quadrature points minus that at the points, relative to the facet length. The
 # package accepts 15 % if tangent planes explain it, and 2 % for the quadrature.
 MAX_PENETRATION = 0.2
 # Relative change of the contact force with geometry at the deformed positions; the package refuses
 # a first-order estimate above 20 %.
-_GEOMETRY_CHANGE, _REFUSED_CHANGE = 0.5, 0.2
+_FORCE_CHANGE, _REFUSED_FORCE_CHANGE = 0.5, 0.2
 # Distance relative to the mesh size beyond which a solution is on another branch.
-_OTHER_BRANCH = 0.1
+_BRANCH_DISTANCE = 0.1
 # Depth of a narrow rod between points, relative to the facet length: the package accepts 5 % and
 # 2 % for the quadrature.
 _ROD_DEPTH = 0.07
 # Number of parts of an increment in which the path of a rod is evaluated.
-_PARTS = 64
+_N_ROD_SUBSTEPS = 64
 # Relative difference of forces from the nearest exact solution, and from the independent history;
 # and from the latter if friction multipliers are not unique at the edge of Γc.
-_NEAREST, _INDEPENDENT = 1e-5, 1e-4
-_AT_EDGE = 1e-2
+_NEAREST_FORCE_TOLERANCE, _INDEPENDENT_FORCE_TOLERANCE = 1e-5, 1e-4
+_NONUNIQUE_FORCE_TOLERANCE = 1e-2
 
 
 def sample_surface(surface: Any, u: Array, n: int = 9) -> tuple[Array, Array, Array]:
@@ -71,36 +71,38 @@ def sample_surface(surface: Any, u: Array, n: int = 9) -> tuple[Array, Array, Ar
     return surface.position(facet, xi, u)[0], surface.position(facet, xi)[0], facet
 
 
-class Judge:
+class Comparison:
     """Compares the package's increments with the independent solver, one by one.
 
     Attributes:
-        wrong: Descriptions of failed checks.
-        another: Differences that the laws permit, because the solution is not unique.
-        unjudged: Increments and checks in which the independent solver has failed.
-        worst: By check, the largest ratio of error to tolerance.
+        failed_checks: Descriptions of failed checks.
+        other_solutions: Differences that the laws permit, because the solution is not unique.
+        not_compared: Increments and checks in which the independent solver has failed.
+        error_ratios: By check, the largest ratio of error to tolerance.
     """
 
     def __init__(self, scene: dict[str, Any]) -> None:
         """Create the independent problem twice, for both histories."""
         self.scene = scene
-        self.wrong: list[str] = []
-        self.another: list[str] = []
-        self.unjudged: list[str] = []
-        self.worst: dict[str, float] = {}
+        self.failed_checks: list[str] = []
+        self.other_solutions: list[str] = []
+        self.not_compared: list[str] = []
+        self.error_ratios: dict[str, float] = {}
         # The error of integrals between curved facets is proportional to the square of their slope.
         paired = any(c["obstacle"]["kind"] == "body" for c in scene["contacts"])
         slope = 4 * sum(map(abs, scene.get("bend", [0.0])))
-        self._integration_error = _CURVED * slope**2 if paired else 0.0
+        self._integration_error = _CURVED_INTEGRATION_ERROR * slope**2 if paired else 0.0
         scaled = any(
-            (c["law"].get(k) or [""])[0] == "scaled" for c in scene["contacts"] for k in _K
+            (c["law"].get(k) or [""])[0] == "scaled"
+            for c in scene["contacts"]
+            for k in _STIFFNESS_NAMES
         )
         if scaled and scene["cell"] == "hexahedron" and any(b["jitter"] for b in scene["bodies"]):
-            self._integration_error += _SMOOTHED
+            self._integration_error += _SMOOTHED_MODULUS_ERROR
         self.problem, setup, self._load = self._make_problem(scene)
         self._curvature_height = sum(map(abs, scene.get("bend", []))) * setup.length
         self._translation = setup.length * float(np.abs(scene.get("translation", [0.0])).max())
-        self._earlier_overlap: dict[int, float] = {}  # largest one by contact
+        self._earlier_penetration: dict[int, float] = {}  # largest one by contact
         self._other = self._make_problem(scene)[0]
         self.problem.largest_translation = self._other.largest_translation = self._translation
         self._moduli = setup.moduli
@@ -125,7 +127,7 @@ class Judge:
         name = f"stage {record['stage']} at {record['load']:.4g}"
         problem, load = self.problem, self._load(record["stage"], record["load"])
         self._change_friction(record["stage"])
-        self._pair_within(record)
+        self._repeat_pair_updates(record)
         self._check_slip_resets(name, record, load)
         u = self._nodal_values(record["u"])
         motion = np.array([record["contacts"][c]["motion"][i] for c, i in problem.free_motions()])
@@ -140,7 +142,9 @@ class Judge:
         rtol = record["rtol"]
 
         miss = np.abs(u[load.fixed] - load.values).max(initial=0.0)
-        allowed = 1e-12 * max(np.abs(u).max(), 1e-300) + _STEPPED * np.abs(self._u).max()
+        allowed = (
+            1e-12 * max(np.abs(u).max(), 1e-300) + _DISPLACEMENT_ROUND_OFF * np.abs(self._u).max()
+        )
         self._check(name, "conditions", miss, allowed)
         self._check_equations(name, now, rtol)
         for i, (c, f, r) in enumerate(
@@ -148,7 +152,7 @@ class Judge:
         ):
             self._check_results(f"{name}, contact {i}", c, f, r)
             self._check_multipliers(f"{name}, contact {i}", c, f, r, load.fixed)
-        self._check_overlap(name, u, found, now)
+        self._check_opposite_penetration(name, u, found, now)
         self._check_penetration(name, u, load, motion, found)
         self._check_kinematics(name, u, motion, load, old, now)
         self._check_energy(name, record, u, motion, load, found, now)
@@ -177,17 +181,21 @@ class Judge:
         self._change_friction(stage)
         try:
             u, motion, old = self.problem.solve(self._u, self._motion, load, self._state)
-        except (reference.Failed, np.linalg.LinAlgError):
+        except (reference.NotSolved, np.linalg.LinAlgError):
             return "not solved apart"
-        before, self.wrong, self.worst = (self.wrong, self.worst), [], {}
+        before, self.failed_checks, self.error_ratios = (
+            (self.failed_checks, self.error_ratios),
+            [],
+            {},
+        )
         found = self.problem.evaluate(u, motion, load, old)
         now = self._forces(u, load, found)
-        self._check_overlap("", u, found, now)
+        self._check_opposite_penetration("", u, found, now)
         self._check_penetration("", u, load, motion, found)
         self._check_kinematics("", u, motion, load, old, now)
-        limits = {"kinematics": _REFUSED_CHANGE / _GEOMETRY_CHANGE}
-        error = sorted(n for n, share in self.worst.items() if share > limits.get(n, 1.0))
-        self.wrong, self.worst = before
+        limits = {"kinematics": _REFUSED_FORCE_CHANGE / _FORCE_CHANGE}
+        error = sorted(n for n, ratio in self.error_ratios.items() if ratio > limits.get(n, 1.0))
+        self.failed_checks, self.error_ratios = before
         return f"rightly: {', '.join(error)}" if error else "solved apart"
 
     def _change_friction(self, stage: int) -> None:
@@ -199,13 +207,13 @@ class Judge:
 
     def _check(self, where: str, what: str, value: float, allowed: float, text: str = "") -> bool:
         with np.errstate(all="ignore"):
-            share = float(value / allowed) if allowed > 0 else (0.0 if value == 0 else np.inf)
+            ratio = float(value / allowed) if allowed > 0 else (0.0 if value == 0 else np.inf)
         if not np.isfinite(value):
-            share = np.inf
-        self.worst[what] = max(self.worst.get(what, 0.0), share)
-        if share > 1.0:
-            self.wrong.append(f"{what}: {where}: {value:.3g} above {allowed:.3g}{text}")
-        return share <= 1.0
+            ratio = np.inf
+        self.error_ratios[what] = max(self.error_ratios.get(what, 0.0), ratio)
+        if ratio > 1.0:
+            self.failed_checks.append(f"{what}: {where}: {value:.3g} above {allowed:.3g}{text}")
+        return ratio <= 1.0
 
     def _nodal_values(self, rows: Array) -> Array:
         """Return the displacement at the nodes of the independent problem."""
@@ -247,11 +255,13 @@ class Judge:
                 )
                 found = now[i]
                 strain = self._non_rigid_part(u - before, before, load)
-                allowed = _POSITION * np.abs(u - before).max() + _ROUND_OFF * size
+                allowed = (
+                    _POSITION_TOLERANCE * np.abs(u - before).max() + _POSITION_ROUND_OFF * size
+                )
                 self._check(name, "positioning rigid", strain, allowed)
                 deeper_by = deeper - max(depth, 0.0)
-                self._check(name, "positioning depth", deeper_by, _POSITION * size)
-                self._check(name, "positioning gap", -deeper, _POSITION * size)
+                self._check(name, "positioning depth", deeper_by, _POSITION_TOLERANCE * size)
+                self._check(name, "positioning gap", -deeper, _POSITION_TOLERANCE * size)
             else:
                 found = self._first_touch(model, record_i, u, old[i])
                 overclosure = found["overclosure"][model.paired].max()
@@ -271,7 +281,7 @@ class Judge:
                 other = self._first_touch(own, record_i, u, state)
             self._other_state[i] = own.reset_slip(other, state, unloaded)
         for miss in np.abs(touching[touching > -np.inf]):
-            self._check(name, "first touch", float(miss), _POSITION * size)
+            self._check(name, "first touch", float(miss), _POSITION_TOLERANCE * size)
 
     def _groups(self) -> Array:
         """Return the number of the group of coupled bodies of every contact."""
@@ -355,7 +365,7 @@ class Judge:
             # I + ∇u has the round-off of 1 even for u = 0.
             cells = min(min(body["n"]) for body in self.scene["bodies"])
             moved = moved + np.ptp(problem.body.nodes_x, axis=0).max() / cells
-        rounding = _ROUNDING * (np.abs(problem.stiffness(u)) @ moved)
+        rounding = _RESIDUAL_ROUND_OFF * (np.abs(problem.stiffness(u)) @ moved)
         for c, f in zip(problem.contacts, found, strict=True):
             each = np.abs(c.interpolation).T @ (c.weights * self._roundoff(c, f))
             rounding += np.repeat(each, c.d)
@@ -400,14 +410,14 @@ class Judge:
     def _check_equations(self, name: str, now: dict[str, Any], rtol: float) -> None:
         for b, body in enumerate(now["bodies"]):
             size = self._force_size(now, "bodies", b)
-            allowed = (_RESIDUAL * rtol + self._integration_error) * size + body["rounding"]
+            allowed = (_RESIDUAL_RATIO * rtol + self._integration_error) * size + body["rounding"]
             text = f"; forces {size:.3g}"
             self._check(f"{name}, body {b}", "equations", body["residual"], allowed, text)
         if len(now["motion rest"]):
             size = max(self._force_size(now, "contacts", i) for i in range(len(now["contacts"])))
             rest = float(np.abs(now["motion rest"]).max())
             rounding = max(b["rounding"] for b in now["bodies"])
-            self._check(name, "obstacle", rest, _RESIDUAL * rtol * size + rounding)
+            self._check(name, "obstacle", rest, _RESIDUAL_RATIO * rtol * size + rounding)
 
     def _check_results(self, name: str, contact: Any, found: dict, record: dict[str, Any]) -> None:
         """Compare reported forces, area and tractions with those evaluated from u."""
@@ -417,24 +427,24 @@ class Judge:
         # The integration error between curved facets also affects the slip, by which the committed
         # τ may be cancelled.
         before = np.linalg.norm(found["tau_old"], axis=1)
-        taken_back = self._integration_error * float(w @ before)
+        slip_error = self._integration_error * float(w @ before)
         rounding = self._roundoff(contact, found)
-        same = _SUMS + self._integration_error
+        same = _SUM_TOLERANCE + self._integration_error
         allowed = same * size + rounding * w.sum()
         self._check(
             name,
             "reported force",
             np.abs(record["force"] - w @ found["traction"]).max(),
-            allowed + taken_back,
+            allowed + slip_error,
         )
         self._check(name, "reported N", abs(record["normal_force"] + w @ r_n), allowed)
         tangential = w @ np.linalg.norm(tau, axis=1)
         self._check(
-            name, "reported T", abs(record["tangential_force"] - tangential), allowed + taken_back
+            name, "reported T", abs(record["tangential_force"] - tangential), allowed + slip_error
         )
-        bears = contact.law.tension | (r_n < 0)
+        is_closed = contact.law.tension | (r_n < 0)
         doubtful = np.abs(r_n) <= rounding
-        low, high = w @ (bears & ~doubtful), w @ (bears | doubtful)
+        low, high = w @ (is_closed & ~doubtful), w @ (is_closed | doubtful)
         if contact.law.tension:
             low = 0.0 if not contact.paired.all() else low
         error = max(low - record["area"], record["area"] - high, 0.0)
@@ -456,7 +466,7 @@ class Judge:
         difference -= sum_points(their, record["measure"][:, None] * np.column_stack(reported))
         peak = np.abs(found["traction"]).max(initial=0.0)
         traction = np.abs(difference[:, 1:]).max()
-        allowed = (same * peak + rounding) * w.max() + taken_back
+        allowed = (same * peak + rounding) * w.max() + slip_error
         self._check(name, "reported traction", traction, allowed)
         self._check(name, "weights", np.abs(difference[:, 0]).max(), 1e-9 * w.max())
 
@@ -514,18 +524,22 @@ class Judge:
             )
             # Linear multipliers do not resolve the curvature of a coarse facet.
             bulges = self._flatness(self.scene["contacts"][self.problem.contacts.index(contact)])
-            self._check(name, "multiplier penetration", depth, _PENETRATION * size + bulges)
+            self._check(
+                name, "multiplier penetration", depth, _MULTIPLIER_PENETRATION * size + bulges
+            )
 
     def _flatness(self, given: dict[str, Any]) -> float:
         """Return the deviation of the facets of both surfaces of a contact from planes (length)."""
         return float(self._curvature_height / self.scene["bodies"][given["body"]]["n"][0] ** 2)
 
-    def _check_overlap(self, name: str, u: Array, found: list[dict], now: dict[str, Any]) -> None:
+    def _check_opposite_penetration(
+        self, name: str, u: Array, found: list[dict], now: dict[str, Any]
+    ) -> None:
         """Check that the opposing surface has not passed through Γc between its points."""
         for i, contact in enumerate(self.problem.contacts):
-            if contact.overlap is None or not contact.law.has_normal:
+            if contact.opposite_penetration is None or not contact.law.has_normal:
                 continue
-            pushed = float(contact.k_n.mean() * contact.overlap(u))
+            pushed = float(contact.k_n.mean() * contact.opposite_penetration(u))
             # Coarse bodies overlap between the points by elastic deformation, in proportion to the
             # force of this contact or of the one with exchanged sides.
             same = [j for j in range(len(found)) if self._surfaces(j) == self._surfaces(i)]
@@ -544,8 +558,8 @@ class Judge:
             # remain after unloading.
             few = self.scene["contacts"][i].get("quadrature", np.inf) < 2 * self.scene["degree"]
             if few or not contact.paired.all():
-                allowed += self._earlier_overlap.get(i, 0.0)
-                self._earlier_overlap[i] = max(pushed, self._earlier_overlap.get(i, 0.0))
+                allowed += self._earlier_penetration.get(i, 0.0)
+                self._earlier_penetration[i] = max(pushed, self._earlier_penetration.get(i, 0.0))
             self._check(f"{name}, contact {i}", "passed through", pushed, allowed)
 
     def _check_penetration(
@@ -563,8 +577,10 @@ class Judge:
             np.maximum.at(traction, corners[c.facet], np.maximum(f["overclosure"], 0.0)[:, None])
             depth_at_points = traction[corners].max(axis=1)[facet]
             bulge = self._flatness(self.scene["contacts"][i])
-            share = (depth - depth_at_points - bulge) / c.slave.lengths()[facet]
-            self._check(f"{name}, contact {i}", "penetration", share.max(), MAX_PENETRATION)
+            relative_depth = (depth - depth_at_points - bulge) / c.slave.lengths()[facet]
+            self._check(
+                f"{name}, contact {i}", "penetration", relative_depth.max(), MAX_PENETRATION
+            )
             if c.centreline is not None and c.d == 2:
                 self._check_rod_crossing(f"{name}, contact {i}", i, u, c.centreline_at(shift))
 
@@ -583,9 +599,9 @@ class Judge:
         last = sample_surface(contact.slave, u)[0]
         order = np.argsort(at[:, 0])
         height = np.zeros(len(spine))
-        for share in np.linspace(0, 1, _PARTS + 1):
-            x = (first + share * (last - first))[order]
-            q = start + share * (spine - start)
+        for fraction in np.linspace(0, 1, _N_ROD_SUBSTEPS + 1):
+            x = (first + fraction * (last - first))[order]
+            q = start + fraction * (spine - start)
             height = q[:, 1] - np.interp(q[:, 0], x[:, 0], x[:, 1])
             over = (q[:, 0] > x[:, 0].min()) & (q[:, 0] < x[:, 0].max())
             # 0: not over Γc; -1: below it; 1: has crossed it; 2: has entered by another side.
@@ -630,11 +646,16 @@ class Judge:
             if not changed:
                 return
             near, moved = problem.equilibrate(u, motion, load, old, 1e-9)
-            if np.abs(near - u).max() > _OTHER_BRANCH * np.ptp(problem.body.nodes_x, axis=0).max():
-                raise reference.Failed("the solution with deformed geometry is on another branch")
+            if (
+                np.abs(near - u).max()
+                > _BRANCH_DISTANCE * np.ptp(problem.body.nodes_x, axis=0).max()
+            ):
+                raise reference.NotSolved(
+                    "the solution with deformed geometry is on another branch"
+                )
             forces = self._forces(near, load, problem.evaluate(near, moved, load, old))["contacts"]
-        except (reference.Failed, np.linalg.LinAlgError) as failure:
-            self.unjudged.append(f"{name}: kinematics: {failure}")
+        except (reference.NotSolved, np.linalg.LinAlgError) as failure:
+            self.not_compared.append(f"{name}: kinematics: {failure}")
             return
         finally:
             for c, (gap_function, interpolation, paired) in zip(
@@ -646,7 +667,7 @@ class Judge:
             same = [j for j in range(len(forces)) if self._surfaces(j) == self._surfaces(i)]
             size = max(max(self._force_size(now, "contacts", j), forces[j]["size"]) for j in same)
             error = abs(sum(forces[j]["normal"] - now["contacts"][j]["normal"] for j in same))
-            allowed = _GEOMETRY_CHANGE * size + 30 * max(b["rounding"] for b in now["bodies"])
+            allowed = _FORCE_CHANGE * size + 30 * max(b["rounding"] for b in now["bodies"])
             self._check(f"{name}, contact {i}", "kinematics", error, allowed)
 
     @staticmethod
@@ -684,28 +705,35 @@ class Judge:
         work = 0.5 * outside @ displacement
         elastic = 0.5 * inside @ displacement
         springs = sum(c.stored_energy(f) for c, f in zip(problem.contacts, found, strict=True))
-        slid = sum(c.dissipated_energy(f) for c, f in zip(problem.contacts, found, strict=True))
-        pushes = np.array([load.obstacle_forces[c][i] for c, i in problem.free_motions()])
-        work += 0.5 * pushes @ (motion - self._motion)
+        dissipated = sum(
+            c.dissipated_energy(f) for c, f in zip(problem.contacts, found, strict=True)
+        )
+        obstacle_forces = np.array([load.obstacle_forces[c][i] for c, i in problem.free_motions()])
+        work += 0.5 * obstacle_forces @ (motion - self._motion)
         forces = [c["force"] for c in now["contacts"]]
-        ways = load.shifts
+        displacements = load.shifts
         if before is not None:
-            work += 0.5 * before["outside"] @ displacement + 0.5 * before["pushes"] @ (
+            work += 0.5 * before["outside"] @ displacement + 0.5 * before["obstacle_forces"] @ (
                 motion - self._motion
             )
             elastic += 0.5 * before["inside"] @ displacement
             springs -= before["springs"]
             ends = zip(forces, before["contacts"], strict=True)
             forces = [f + b["force"] for f, b in ends]
-            ways = [s - b for s, b in zip(load.shifts, before["shifts"], strict=True)]
-        work += sum(0.5 * f @ s for f, s in zip(forces, ways, strict=True))
-        now |= {"outside": outside, "inside": inside, "shifts": load.shifts, "pushes": pushes}
+            displacements = [s - b for s, b in zip(load.shifts, before["shifts"], strict=True)]
+        work += sum(0.5 * f @ s for f, s in zip(forces, displacements, strict=True))
+        now |= {
+            "outside": outside,
+            "inside": inside,
+            "shifts": load.shifts,
+            "obstacle_forces": obstacle_forces,
+        }
         energy = record["energy"]
         if energy is None:
             return
         penalty = all(c.projection is None for c in problem.contacts)
-        scale = np.abs(outside) @ np.abs(displacement) + abs(springs) + abs(slid)
-        scale += sum(np.abs(f) @ np.abs(s) for f, s in zip(forces, ways, strict=True))
+        scale = np.abs(outside) @ np.abs(displacement) + abs(springs) + abs(dissipated)
+        scale += sum(np.abs(f) @ np.abs(s) for f, s in zip(forces, displacements, strict=True))
         if before is not None:
             scale += np.abs(before["outside"]) @ np.abs(displacement)
         allowed = max(1e-6, 300 * record["rtol"], self._integration_error) * scale
@@ -720,12 +748,12 @@ class Judge:
         if penalty:
             pairs += [
                 ("springs", energy.springs, springs),
-                ("dissipation", energy.dissipation, slid),
+                ("dissipation", energy.dissipation, dissipated),
             ]
-        for what, given, own in pairs:
-            self._check(name, f"energy {what}", abs(given - own), allowed)
-        if penalty and slid < -allowed:
-            self.wrong.append(f"energy: {name}: dissipation {slid:.3g} is negative")
+        for what, reported, computed in pairs:
+            self._check(name, f"energy {what}", abs(reported - computed), allowed)
+        if penalty and dissipated < -allowed:
+            self.failed_checks.append(f"energy: {name}: dissipation {dissipated:.3g} is negative")
 
     def _tolerance(self, record: dict[str, Any], base: float) -> float:
         """Return the relative tolerance of forces, at least ``base``."""
@@ -761,17 +789,19 @@ class Judge:
         """Compare forces with the exact solution that the independent solver finds from u."""
         try:
             near, moved = self.problem.equilibrate(u, motion, load, old, 1e-12)
-        except reference.Failed as failure:
-            self.unjudged.append(f"{name}: nearest: {failure}")
+        except reference.NotSolved as failure:
+            self.not_compared.append(f"{name}: nearest: {failure}")
             return
         exact = self._forces(near, load, self.problem.evaluate(near, moved, load, old))
         for i, contact in enumerate(exact["contacts"]):
             size = self._force_size(now, "contacts", i)
             rounding = max(b["rounding"] for b in now["bodies"])
             error = np.abs(contact["force"] - now["contacts"][i]["force"]).max()
-            allowed = self._tolerance(record, _NEAREST) * size + 10 * rounding
+            allowed = self._tolerance(record, _NEAREST_FORCE_TOLERANCE) * size + 10 * rounding
             if error > allowed and not self._is_unique():
-                self.another.append(f"{name}, contact {i}: nearest differs by {error / size:.1e}")
+                self.other_solutions.append(
+                    f"{name}, contact {i}: nearest differs by {error / size:.1e}"
+                )
             else:
                 self._check(f"{name}, contact {i}", "nearest", error, allowed)
 
@@ -786,13 +816,13 @@ class Judge:
             u, motion, old = problem.solve(
                 self._other_u, self._other_motion, load, self._other_state
             )
-        except (reference.Failed, np.linalg.LinAlgError) as failure:
-            self.unjudged.append(f"{name}: independent: {failure}")
+        except (reference.NotSolved, np.linalg.LinAlgError) as failure:
+            self.not_compared.append(f"{name}: independent: {failure}")
             self._other_failed = True
             return
         found = problem.evaluate(u, motion, load, old)
-        tolerance = self._tolerance(record, _INDEPENDENT)
-        worst = 0.0
+        tolerance = self._tolerance(record, _INDEPENDENT_FORCE_TOLERANCE)
+        largest_ratio = 0.0
         rounding = max(b["rounding"] for b in now["bodies"])
         forces = self._unique_forces(problem, found, problem.contact_force(found), load)
         for i in range(len(forces)):
@@ -801,15 +831,19 @@ class Judge:
             error = np.abs(force - given).max()
             allowed = tolerance * size + 30 * rounding
             if allowed > 0:
-                worst = max(worst, error / allowed)
+                largest_ratio = max(largest_ratio, error / allowed)
             text = f"{name}, contact {i}: {given} by the package, {force} independently"
             if error > allowed:
                 reported = self._is_unique() and not (
-                    self._has_free_multipliers(load) and error <= _AT_EDGE * size
+                    self._has_free_multipliers(load) and error <= _NONUNIQUE_FORCE_TOLERANCE * size
                 )
-                (self.wrong if reported else self.another).append("independent: " + text)
-        self.worst["independent"] = max(self.worst.get("independent", 0.0), worst)
-        if worst > 1.0:
+                (self.failed_checks if reported else self.other_solutions).append(
+                    "independent: " + text
+                )
+        self.error_ratios["independent"] = max(
+            self.error_ratios.get("independent", 0.0), largest_ratio
+        )
+        if largest_ratio > 1.0:
             self._other_failed = True
         self._other_state = [
             c.next_state(f, o) for c, f, o in zip(problem.contacts, found, old, strict=True)
@@ -851,13 +885,13 @@ class Judge:
             reported.append(free.reshape(-1, c.d)[own].sum(axis=0))
         return reported
 
-    def _pair_within(self, record: dict[str, Any]) -> None:
+    def _repeat_pair_updates(self, record: dict[str, Any]) -> None:
         """Find the pairs at the displacements at which the package found them in the increment."""
         for i, reported in enumerate(record["contacts"]):
             if reported["paired_at"] is not None:
                 at = self._nodal_values(reported["paired_at"])
-                self._update_pairs_of(self.problem, self._state, i, at, self._u)
-                self._update_pairs_of(self._other, self._other_state, i, at, self._other_u)
+                self._update_contact_pairs(self.problem, self._state, i, at, self._u)
+                self._update_contact_pairs(self._other, self._other_state, i, at, self._other_u)
 
     def _update_pairs(
         self, problem: Any, states: list[Any], u: Array, record: dict[str, Any]
@@ -865,14 +899,16 @@ class Judge:
         """Update pairs and slip references at a committed state."""
         for i, reported in enumerate(record["contacts"]):
             if reported["updates_pairs"]:
-                self._update_pairs_of(problem, states, i, u, u)
+                self._update_contact_pairs(problem, states, i, u, u)
 
     @staticmethod
-    def _update_pairs_of(problem: Any, states: list[Any], i: int, at: Array, u: Array) -> None:
-        """Find the pairs of a contact at displacement ``at``; u is the committed displacement."""
+    def _update_contact_pairs(
+        problem: Any, states: list[Any], i: int, pairing_displacement: Array, u: Array
+    ) -> None:
+        """Find the pairs of a contact at a displacement; u is the committed displacement."""
         contact = problem.contacts[i]
         if contact.update_pairs is None:
             return
         before = contact.jump(u)
-        contact.update_pairs(at)
+        contact.update_pairs(pairing_displacement)
         states[i].jump += contact.jump(u) - before
