@@ -331,15 +331,17 @@ class ContactProblem:
         if incomplete and not self.solver.is_current():
             self._complete_all()  # before its factors are discarded
         self.solver.equations.factorisations = 0
-        start_unknowns, diagonal = self.full.state(), self.full.diagonal.copy()
+        start_unknowns = self.full.state()
+        # After a failure its values would accept any residual.
+        diagonal = None if self.full.bulk.linear else self.full.diagonal
         at_present = self._is_present(start_unknowns)
         self._restore_committed_pairs()
 
         def reset() -> None:
             # The interior of the present state may have been recovered meanwhile.
             self._reset_to(self._present.unknowns if at_present else start_unknowns)
-            if not self.full.bulk.linear:  # after a failure the scale would accept any residual
-                self.full.diagonal = diagonal.copy()
+            if diagonal is not None:
+                self.full.diagonal = diagonal
 
         try:
             # A line search may overflow, which the convergence test and the verdict detect. A

@@ -109,7 +109,7 @@ def test_table_of_an_error_budget(solved_block):
     for line, row in zip(lines[1:], rows[:-1], strict=False):
         assert " ".join(line.split()) == " ".join(row)
     assert rows[-1][0] == "together"
-    assert [float(c) for c in rows[-1][1:]] == pytest.approx(
+    assert [float(c.removesuffix(" %")) for c in rows[-1][1:]] == pytest.approx(
         [100 * t for t in budget.total.values()], rel=0.06
     )
     assert remarks == lines[len(rows) :]

@@ -27,6 +27,7 @@ from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.mass import assemble_values, create_mass_solver
 from fenics_contact.surface.surface import PointEvaluator
 from fenics_contact.types import Array
+from fenics_contact.wording import percent
 
 __all__ = ["ErrorBudget", "estimate_errors", "quantities"]
 
@@ -121,28 +122,26 @@ class ErrorBudget:
         return max(self.parts, key=lambda part: max(self.relative(part).values(), default=0.0))
 
     def __str__(self) -> str:
-        """Return a table of the errors in per cent, and what to change."""
+        """Return a table of the relative errors, and what to change."""
         width = max(14, *(len(name) + 2 for name in self.values))
-        lines = ["error in %".ljust(16) + "".join(f"{name:>{width}}" for name in self.values)]
+        lines = ["relative error".ljust(16) + "".join(f"{name:>{width}}" for name in self.values)]
         for part, *cells in self._rows():
             lines.append(f"{part:<16}" + "".join(f"{cell:>{width}}" for cell in cells))
         return "\n".join([*lines, *self._remarks()])
 
     def _repr_html_(self) -> str:
-        """Return a table of the errors in per cent for notebooks, with the total."""
+        """Return a table of the relative errors for notebooks, with the total."""
         total = self.total
-        total_row = ("together", *(f"{100 * total[name]:.2g}" for name in self.values))
-        header = ("error in %", *self.values)
+        total_row = ("together", *(percent(total[name]) for name in self.values))
+        header = ("relative error", *self.values)
         return html_table("Error budget", header, [*self._rows(), total_row], self._remarks())
 
     def _rows(self) -> list[tuple[str, ...]]:
-        """Return every source with its errors in per cent."""
+        """Return every source with its relative errors."""
         rows = []
         for part in _REMEDIES:
             errors = self.relative(part) if part in self.parts else {}
-            cells = (
-                f"{100 * errors[n]:.2g}" if n in errors else "not estimated" for n in self.values
-            )
+            cells = (percent(errors[n]) if n in errors else "not estimated" for n in self.values)
             rows.append((part, *cells))
         return rows
 
