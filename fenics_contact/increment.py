@@ -136,7 +136,7 @@ class IncrementSolver:
         if stiffness_changed and self.full.bulk.linear:
             self.modulus.measure()
         positioning = InitialPositioning(self.full, solver.equations.motions, load, before)
-        cold = positioning.position_bodies(first=state.increment == 0)
+        was_unloaded = positioning.position_bodies(first=state.increment == 0)
         if solver.select_dofs():
             return Retry.UNKNOWNS
         solver.update_system(stiffness_changed)
@@ -149,7 +149,7 @@ class IncrementSolver:
         solver.predictor.expected = end if points.end is None else points.end
         with solver.system.restricted_contacts():
             reason, attempts, augmentations = solver.solve(
-                cold=cold,
+                was_unloaded=was_unloaded,
                 stiffness_changed=stiffness_changed,
                 load_before=state.load,
                 balance=not points.replaced,

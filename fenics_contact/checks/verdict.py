@@ -26,7 +26,8 @@ _SCALED_ROUND_OFF_RATIO = 16 * np.finfo(float).eps / _LAW_TOLERANCE
 # Energy supplied by friction relative to the energy exchanged: 6 % if a tangential load is reversed
 # in one increment, half or more in states that smaller increments do not lead to.
 _MAX_FRICTION_ENERGY_GAIN = 0.25
-# Displacement without rigid-body motion, half of the relative one of the ends, by the body's size.
+# Largest displacement of a body without its rigid-body motion, relative to its size: half of the
+# relative displacement of its ends.
 _MAX_DEFORMATION_RATIO = 5.0
 
 

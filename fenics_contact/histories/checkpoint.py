@@ -57,9 +57,9 @@ __all__ = [
     "check_places",
     "exists",
     "load",
+    "load_restart",
     "read",
     "save",
-    "take_up",
 ]
 
 logger = logging.getLogger("fenics_contact")
@@ -165,7 +165,7 @@ def load(
     """
     check_mismatch(on_mismatch)
     stored = read(problem, path)
-    take_up(problem, stored, state_fields=state_fields, on_mismatch=on_mismatch)
+    load_restart(problem, stored, state_fields=state_fields, on_mismatch=on_mismatch)
     return stored.numbers
 
 
@@ -253,7 +253,7 @@ def read(problem: ContactProblem, path: str | Path) -> StoredCheckpoint:
     return StoredCheckpoint(path, scene, arrays)
 
 
-def take_up(
+def load_restart(
     problem: ContactProblem,
     stored: StoredCheckpoint,
     *,

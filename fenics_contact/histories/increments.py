@@ -17,7 +17,7 @@ from fenics_contact.arguments import check_bool, check_instance, is_built_in
 from fenics_contact.contact.contact import Contact
 from fenics_contact.estimates.errors import quantities
 from fenics_contact.failure import NotConverged
-from fenics_contact.histories import checkpoint as states
+from fenics_contact.histories import checkpoint as checkpoints
 from fenics_contact.histories.progress import ProgressBar
 from fenics_contact.histories.table import Table
 from fenics_contact.methods.attempt import Attempt
@@ -144,12 +144,12 @@ def increments(
         if not isinstance(number, int | np.integer) or number < least:
             raise ValueError(f"{name} is {number!r}; it must be an integer, at least {least}")
     check_bool("estimate", estimate)
-    states.check_mismatch(on_mismatch)
+    checkpoints.check_mismatch(on_mismatch)
     if not isinstance(state_fields, Sequence):
         raise ValueError(
             f"state_fields is a {type(state_fields).__name__}; it must be a list of fem.Functions"
         )
-    states.check_fields(problem, state_fields)
+    checkpoints.check_fields(problem, state_fields)
     if state_fields and checkpoint is None:
         raise ValueError("state_fields are saved in the checkpoint; give checkpoint=..., too")
     if not isinstance(checkpoint, str | Path | None):
@@ -158,7 +158,7 @@ def increments(
         _check_constant(problem, load, start, end)
     file = None if checkpoint is None else Path(checkpoint)
     if file is not None:
-        states.check_places(problem)
+        checkpoints.check_places(problem)
     with collective_errors(comm):
         if file is not None and comm.rank == 0:
             files.check_folder("checkpoint", file)
@@ -312,7 +312,7 @@ def _solve(
         progress = _Progress(*stored.numbers[:n])
         error = dict(zip(error, stored.numbers[n:], strict=True))
         try:
-            states.take_up(
+            checkpoints.load_restart(
                 problem,
                 stored,
                 loads=lambda: apply(progress.load),
@@ -335,7 +335,7 @@ def _solve(
         numbers = [*dataclasses.astuple(progress), *error.values()]
         assert checkpoint is not None
         notes = [dataclasses.asdict(each) for each in programme.segments]
-        states.save(problem, checkpoint, numbers, state_fields=fields, notes=notes)
+        checkpoints.save(problem, checkpoint, numbers, state_fields=fields, notes=notes)
 
     direction = 1.0 if end >= start else -1.0
     n_unsaved = n_skipped = 0
@@ -458,7 +458,7 @@ class _LoadSegment:
 
 @dataclasses.dataclass
 class _LoadProgramme:
-    """Successive calls of `increments` for a checkpoint file; all complete without a state."""
+    """Successive calls of `increments` for a checkpoint file, all complete if it has no state."""
 
     segments: list[_LoadSegment]
     has_state: bool
@@ -470,7 +470,7 @@ _programmes = weakref.WeakKeyDictionary()
 
 def _locate_segment(
     problem: ContactProblem, checkpoint: Path, segment: _LoadSegment
-) -> tuple[_LoadProgramme, states.StoredCheckpoint | None]:
+) -> tuple[_LoadProgramme, checkpoints.StoredCheckpoint | None]:
     """Return the calls up to this one, and the checkpoint to be loaded, or None. Collective.
 
     Raises:
@@ -487,10 +487,10 @@ def _locate_segment(
         and segment.is_equal(segments[-1], up_to=segments[-1].reached)
     )
     earlier = segments[:-1] if again else segments
-    has_file = (again or not known.has_state) and states.exists(problem, checkpoint)
+    has_file = (again or not known.has_state) and checkpoints.exists(problem, checkpoint)
     if not has_file and (known.has_state or not segments):
         return _LoadProgramme([*earlier, segment], True), None
-    stored = states.read(problem, checkpoint) if has_file else None
+    stored = checkpoints.read(problem, checkpoint) if has_file else None
     try:
         theirs = [_LoadSegment(**each) for each in stored.notes or ()] if stored else []
     except TypeError:  # notes of a caller of `checkpoint.save`

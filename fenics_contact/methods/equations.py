@@ -28,7 +28,7 @@ from fenics_contact.types import Array
 __all__ = ["Equations"]
 
 
-# Stiffness of open points in H₀ by that of closed ones: constrains a body whose contact is open.
+# Stiffness of open relative to closed points in H₀: constrains a body whose contact is open.
 _OPEN_STIFFNESS_RATIO = 1e-3
 # Least regularisation of a mode, which may have no unbalanced force.
 _MIN_REGULARISATION_RATIO = 1e-6

@@ -19,7 +19,7 @@ from fenics_contact.types import Array, Mask
 
 __all__ = ["set_slip_reference_at_touch"]
 
-_TOUCHING_GAP_RATIO = 1e-6  # tolerance of the least gap at first touch, by the initial least gap
+_TOUCHING_GAP_RATIO = 1e-6  # least gap at first touch, relative to the initial one
 
 
 def set_slip_reference_at_touch(

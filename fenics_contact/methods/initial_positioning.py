@@ -27,14 +27,14 @@ from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["InitialPositioning"]
 
-# Least work of the load in the modes towards contact by that in all modes.
+# Least ratio of the work of the load in modes towards contact to that in all modes.
 _MIN_WORK_RATIO = 0.5
 # Largest tangential fraction of a mode on Γc with friction, for tilts of up to 0.2.
 _MAX_TANGENTIAL_FRACTION = 0.05
 # Relative rank tolerance of the Gram matrix of modes at touching points.
 _RANK_TOLERANCE = 1e-6
 # Steps with nonlinear gaps: largest angle of the first (radians), which is halved in each step,
-# their number, and length of the last by the largest gap, with a square far below `NEGLIGIBLE`.
+# their number, and ratio of the last to the largest gap, with a square far below `NEGLIGIBLE`.
 _FIRST_ANGLE, _MAX_STEPS, _LAST_STEP_RATIO = 0.2, 30, 1e-6
 
 
@@ -44,7 +44,7 @@ class _FreeModes:
 
     Attributes:
         modes: Indices among all free modes, (n_free,).
-        load: Generalised load by the largest, (n_free,).
+        load: Generalised load relative to its largest component, (n_free,).
         gram: Gram matrix of the modes, (n_free, n_free).
         jumps: Jumps of the modes at the points of every contact, (n_free, n_points, gdim).
     """
@@ -104,7 +104,7 @@ class InitialPositioning:
             full.evaluate_at(present)
         if len(untouched) < len(motions.free) and motions.has_obstacle_rotations:
             # With touching bodies freely rotating obstacles are left to the iteration.
-            untouched = untouched[motions.of_any_body()[untouched]]
+            untouched = untouched[motions.find_body_modes()[untouched]]
         modes = np.union1d(untouched, np.flatnonzero(unloaded))
         # Groups of coupled bodies are positioned separately; unloaded groups stay.
         for group in np.unique(groups[modes]):
@@ -122,7 +122,7 @@ class InitialPositioning:
             touched += (np.abs(jumps[:, closed]) > NEGLIGIBLE).any(axis=(1, 2))
         touched = global_sum(self.full.unknowns.comm, touched)
         # Rotations about a closed point do not displace it: consider all modes of a body.
-        return np.flatnonzero(~(motions.of_same_body() @ (touched > 0)))
+        return np.flatnonzero(~(motions.find_coupled_modes() @ (touched > 0)))
 
     def _position(self, modes: Index) -> None:
         """Move bodies without contact to a rest position, or to first touch. Collective.
@@ -134,7 +134,7 @@ class InitialPositioning:
         full = self.full
         initial = full.state()
         # A free obstacle approaches like a prescribed one: slip counts from its initial position.
-        of_bodies = modes[self.motions.of_any_body()[modes]]
+        of_bodies = modes[self.motions.find_body_modes()[modes]]
         if len(of_bodies) and any(contact.law.has_friction for contact in full.contacts):
             coefficients = None
             with self._obstacles_at_start() as motions:
@@ -321,9 +321,11 @@ class InitialPositioning:
         # Points with a contact force remain closed by ten times the tolerance of the programme.
         gaps = limits[:, -1] / scale + NEGLIGIBLE
         bounds, angle_ends = [limits[:, :-1] @ basis], []
-        has_rotation = motions.turns > 0
+        has_rotation = motions.rotation_length > 0
         if max_angle < np.inf and has_rotation.any():
-            rotations = motions.free[free.modes][:, has_rotation] / motions.turns[has_rotation]
+            rotations = (
+                motions.free[free.modes][:, has_rotation] / motions.rotation_length[has_rotation]
+            )
             angles = rotations.T @ basis
             bounds += [angles, -angles]
             angle_ends += [np.full(2 * len(angles), max_angle / scale)]

@@ -99,7 +99,7 @@ def _find_worst(
         return None
     coupled = []
     for operator in operators:
-        modes = motions.at_points(operator)[rows]
+        modes = motions.jumps_at(operator)[rows]
         if global_max(comm, np.abs(modes)) > 0.0:
             coupled.append((operator.contact, modes))
     contacts = [contact for contact, _ in coupled]

@@ -21,7 +21,8 @@ from fenics_contact.types import Array, Index
 
 __all__ = ["check_balance", "find_free_modes", "unbalanced"]
 
-# Zero generalised force by the largest of the load, and zero entry of unit modes at the points.
+# Negligible generalised force relative to the largest of the load; negligible entry of unit modes
+# at the points.
 _ZERO_FORCE_RATIO, _ZERO_MODE = 1e-8, 1e-10
 # Sides of the circumscribed polygon of the friction cone in space, which excludes no equilibrium.
 _CONE_SIDES = 64
@@ -76,10 +77,10 @@ def check_balance(modes: RigidBodyModes, load: Array, operators: Sequence[Contac
     if not resultant.any():
         return
     comm = modes.comm
-    local_rays = [_compute_admissible_forces(o, modes.at_points(o)[rows]) for o in operators]
+    local_rays = [_compute_admissible_forces(o, modes.jumps_at(o)[rows]) for o in operators]
     all_rays = gather_rows(comm, np.concatenate([np.zeros((0, len(rows))), *local_rays]))
     acts = (np.abs(all_rays) > _ZERO_MODE).astype(np.float64)
-    couples = acts.T @ acts + modes.of_same_body()[np.ix_(rows, rows)]
+    couples = acts.T @ acts + modes.find_coupled_modes()[np.ix_(rows, rows)]
     n_groups, label = scipy.sparse.csgraph.connected_components(couples, directed=False)
     failures: list[str] = []
     for group in (np.flatnonzero(label == number) for number in range(n_groups)):

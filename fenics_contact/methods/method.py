@@ -24,7 +24,7 @@ __all__ = ["Method", "Newton", "SnesMethod", "SolverContext", "StandaloneMethod"
 # with level ratios of 0.93 and 0.96; with 0.25 (Deuflhard's restricted monotonicity) it fails where
 # one point is closed, with a ratio of 0.83.
 _MIN_LEVEL_DECREASE = 0.1
-# Length of a full step by that of the correction, which multigrid computes to a hundredth.
+# Least ratio of a full step to the correction, which multigrid computes to 1 %.
 _FULL_STEP_RATIO = 0.9
 _MAX_STALLED_ITERATIONS = 14  # `ActiveSetMonitor.n_stalled` at which another method takes over
 # Options with the problem's prefix that also apply to the inner solvers.

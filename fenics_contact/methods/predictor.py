@@ -18,8 +18,8 @@ from fenics_contact.types import Array
 
 __all__ = ["Predictor"]
 
-# Residual by the least one up to which the candidate with slipping points is preferred.
-_MAX_STEP_RATIO = 100.0
+# Largest ratio of residual to least residual at which the step by the last tangent is preferred.
+_MAX_RESIDUAL_RATIO = 100.0
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,10 @@ class Predictor:
     Attributes:
         factored: Whether the last factored consistent tangent is that of a solution.
         predict: Whether a step with this tangent may be chosen.
-        change: Change of the state of the full system in the last committed increment; None:
+        change: Change of the state of the full system in the last committed increment; None if
             unknown.
         expected: The state at the end of the increment without new contact, or with the previous
-            pairs; None: unknown.
+            pairs; None if unknown.
     """
 
     def __init__(self, equations: Equations) -> None:
@@ -91,7 +91,7 @@ class Predictor:
                 _ConvergedContact(contact.values, contact.effective_law.tangent(), displacement)
             )
 
-    def choose_initial_guess(self, *, first_augmentation: bool, cold: bool) -> Array:
+    def choose_initial_guess(self, *, first_augmentation: bool, was_unloaded: bool) -> Array:
         """Choose the initial guess of the unknowns nearest to equilibrium. Collective.
 
         Candidates are the present state, a Newton step from it with the tangent of the last
@@ -107,7 +107,7 @@ class Predictor:
 
         Args:
             first_augmentation: Whether loads and obstacles have changed, not only multipliers.
-            cold: Whether there was no contact force before.
+            was_unloaded: Whether there was no contact force before.
         """
         equations, system = self._equations, self._equations.system
         present: Array = system.state()
@@ -131,8 +131,8 @@ class Predictor:
 
         add(present)
         forces = equations.function.array_r.copy()
-        # Without contact force the last increment is no guide.
-        predicts, factored = self.predict and not cold, self.factored and not cold
+        # After an increment without contact force its tangent does not predict this one.
+        predicts, factored = self.predict and not was_unloaded, self.factored and not was_unloaded
         self.invalidate_tangent()
         step = None  # index of the candidate by the tangent of the last solution
         is_reversed = False
@@ -151,14 +151,14 @@ class Predictor:
                     step = add(stepped)
                     is_reversed = self._has_friction_work()
         self._prescribed_change = None
-        if first_augmentation and not predicts and not cold and self.change is not None:
+        if first_augmentation and not predicts and not was_unloaded and self.change is not None:
             add(self._extrapolate(present, forces, self.change))
         if self.expected is not None and first_augmentation:
             add(system.restrict(self.expected))
         if (
             step is not None
             and not is_reversed
-            and residuals[step] <= _MAX_STEP_RATIO * min(residuals)
+            and residuals[step] <= _MAX_RESIDUAL_RATIO * min(residuals)
         ):
             return candidates[step]
         return candidates[int(np.argmin(residuals))]
@@ -174,8 +174,8 @@ class Predictor:
         equations.residual_at(present + path)
         work = np.array([forces @ path, equations.function.array_r @ path])
         first, last = equations.full.unknowns.comm.allreduce(work)
-        stiff = abs(first - last) > FLAT * abs(first)
-        return present + first / (first - last) * path if stiff and np.isfinite(last) else present
+        has_curvature = np.isfinite(last) and abs(first - last) > FLAT * abs(first)
+        return present + first / (first - last) * path if has_curvature else present
 
     def _has_friction_work(self) -> bool:
         """Return whether committed friction does positive work up to the last guess. Collective."""
@@ -190,8 +190,8 @@ class Predictor:
     def _step_by_prescribed_change(self, present: Array, *, reassemble: bool = False) -> Array:
         """Predict the effect of changed prescribed values by one linear step. Collective.
 
-        Otherwise they might invert cells of a nonlinear bulk next to the boundary, from which no
-        iteration recovers.
+        New prescribed values alone may invert cells of a nonlinear bulk next to the boundary, from
+        which no iteration recovers.
 
         Args:
             present: The state with the present prescribed values.

@@ -17,9 +17,10 @@ __all__ = ["QuasiNewton"]
 # Consecutive restarts without a lower residual: the potential may decrease long before it does.
 _MAX_STALLS = 10
 _MAX_OVERLOAD_STALLS = 3  # with an overload of friction at the present pressures
-# Contact force by the initial residual below which the initial active set is not used for H₀.
+# Ratio of contact force to initial residual below which H₀ ignores the initial active set.
 _INACTIVE_FORCE_RATIO = 1e-3
-# Residual by the least one from which on the iteration has diverged and returns to the latter.
+# Ratio of residual to least residual above which the iteration has diverged and returns to the
+# iterate of the least one.
 _DIVERGED_RATIO = 1e3
 
 _REASONS = PETSc.SNES.ConvergedReason

@@ -21,8 +21,8 @@ from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["UnconstrainedModes"]
 
-_STEP_GAP_RATIO = 2.0  # step along an open mode by the gap: half of it closes the gap, too
-_MIN_GAP_RATIO = 1e-64  # least gap by the size of the mesh; its inverse cube does not overflow
+_STEP_GAP_RATIO = 2.0  # step along an open mode relative to the gap, which half of it closes
+_MIN_GAP_RATIO = 1e-64  # least gap relative to the mesh size; its inverse cube does not overflow
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class UnconstrainedModes:
         contact_work = np.zeros((3, len(free_modes)))
         for operator, first in zip(operators, tractions, strict=True):
             contact = operator.contact
-            modes = np.einsum("lm,mqd->lqd", free_modes, motions.at_points(operator))
+            modes = np.einsum("lm,mqd->lqd", free_modes, motions.jumps_at(operator))
             work, initial = (
                 np.einsum("lqd,qd->lq", modes, t) for t in (contact.values.total_traction, first)
             )
@@ -135,7 +135,7 @@ class UnconstrainedModes:
             if mask is not None:
                 apart &= mask
             gap = np.where(apart, np.maximum(gap, _MIN_GAP_RATIO), 1.0)
-            modes = np.einsum("lm,mqd->lqd", self.vectors, motions.at_points(operator))
+            modes = np.einsum("lm,mqd->lqd", self.vectors, motions.jumps_at(operator))
             modes *= apart[:, None]
             approach = np.einsum("lqd,qd->lq", modes, values.normal)
             near = np.where(approach > NEGLIGIBLE, approach, 0.0) / gap

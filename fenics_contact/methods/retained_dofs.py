@@ -118,7 +118,7 @@ class RetainedDofs:
         return self.count > n
 
     def select_dofs(self, *, other_pairs: bool) -> bool:
-        """Return whether `update` has to be called at the start of the increment. Collective.
+        """Select unknowns at the start of an increment; return whether to `update`. Collective.
 
         Args:
             other_pairs: Whether the pairs have changed since the last selection.
@@ -137,7 +137,7 @@ class RetainedDofs:
         return self._next is not None
 
     def needs_more_dofs(self, operators: Sequence[ContactOperator], *, has_solution: bool) -> bool:
-        """Return whether contact acts on further unknowns. Collective.
+        """Return whether contact acts on further unknowns; prepare `update`. Collective.
 
         Args:
             operators: Operators of the contacts over the retained unknowns.

@@ -91,8 +91,9 @@ METHODS: dict[str, type[Method]] = {
     "continuation": Continuation,
 }
 # Methods after a failure: the first for very stiff friction, in few iterations, the second for
-# other problems. The third solved none of 420 random scenes after the others, but released wedges,
-# and finds overloads, as of a tight fit before the first augmentation.
+# other problems. The third solved none of 420 random problems that the others failed on, but some
+# released wedges, and it detects overloads, as of an interference fit before the first
+# augmentation.
 _FALLBACKS = ("primal_dual", "continuation", "alternating")
 
 
@@ -358,12 +359,12 @@ class Solver:
     # ---- the retained dofs -----------------------------------------------------------------------
 
     def select_dofs(self) -> bool:
-        """Return whether the increment needs other retained unknowns, by `change`. Collective."""
+        """Select the retained unknowns; return whether to call `change_dofs`. Collective."""
         others = self.condensed and self._pairings != self._present_pairings()
         return self._retained.select_dofs(other_pairs=others)
 
     def needs_more_dofs(self, *, found: bool) -> bool:
-        """Return whether contact acts on further unknowns, to be added by `change`. Collective.
+        """Return whether contact acts on further unknowns, for `change_dofs` to add. Collective.
 
         Args:
             found: Whether there is a solution, with contacts evaluated on all of Γc.
@@ -426,7 +427,7 @@ class Solver:
     def solve(
         self,
         *,
-        cold: bool,
+        was_unloaded: bool,
         stiffness_changed: bool,
         load_before: Array,
         balance: bool = True,
@@ -435,7 +436,7 @@ class Solver:
         """Solve the increment, with augmentations. Collective.
 
         Args:
-            cold: Whether there was no contact force before.
+            was_unloaded: Whether there was no contact force before.
             stiffness_changed: Whether the bulk's tangent has changed since the last increment.
             load_before: External forces at this rank's unknowns in the committed state (force).
             balance: Whether to raise a ValueError for a load that contact cannot balance.
@@ -451,14 +452,14 @@ class Solver:
 
         def iterate(first: bool) -> tuple[int, list[Attempt]]:
             changed = first and stiffness_changed
-            return self._iterate(first, cold, changed, balance=balance, fallback=fallback)
+            return self._iterate(first, was_unloaded, changed, balance=balance, fallback=fallback)
 
         return solve_augmented_lagrangian(equations, iterate, load_before)
 
     def _iterate(
         self,
         first: bool,
-        cold: bool,
+        was_unloaded: bool,
         stiffness_changed: bool,
         *,
         balance: bool,
@@ -468,7 +469,9 @@ class Solver:
         equations = self.equations
         factored = self.predictor.factored
         equations.monitor.reset()
-        guess = self.predictor.choose_initial_guess(first_augmentation=first, cold=cold)
+        guess = self.predictor.choose_initial_guess(
+            first_augmentation=first, was_unloaded=was_unloaded
+        )
         start: Array = np.divide(guess, equations.length)
         attempts: list[Attempt] = []
         methods: Iterable[str] = self._methods_to_try(start, fallback=fallback, balance=balance)

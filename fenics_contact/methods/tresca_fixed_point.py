@@ -53,7 +53,7 @@ _MIN_RELAXATION = 1 / 8
 # no solution. The overload is accepted after consecutive cycles; a clear one after the second,
 # whose pressures are in equilibrium.
 _OVERLOAD_BOUND_FACTOR, _OVERLOADS = 1.01, 3
-_SUBPROBLEM_RTOL = 1e-2  # residual of a subproblem by that of the complete law
+_SUBPROBLEM_RTOL = 1e-2  # residual of a subproblem relative to that of the complete law
 _SLIP_STIFFNESS_RATIO = 1e-6  # of k_t, regularises the matrix of slipping bodies
 
 _REASONS = PETSc.SNES.ConvergedReason

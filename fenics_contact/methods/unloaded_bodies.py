@@ -61,7 +61,7 @@ def _minimise_motion(
     # At points with a force these modes close no gap, except for round-off.
     free = [~normal for normal, _ in active]
     for _ in range(_MAX_LINEARISATIONS):
-        motion = motions.fit(full.state() - equations.initial_unknowns, part)
+        motion = motions.fit_modes(full.state() - equations.initial_unknowns, part)
         present = [contact.values for contact in full.contacts]
         change = find_least_motion(full, motions, modes, present, motion, free)
         if change is None or np.abs(change).max() <= tolerance:

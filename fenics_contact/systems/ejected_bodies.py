@@ -97,7 +97,7 @@ def _measure_expulsion(
     if not len(modes):
         return motions.size_by_body(zero)
     present = full.state()
-    rigid = motions.fit(present - initial, np.asarray) @ modes.T @ modes
+    rigid = motions.fit_modes(present - initial, np.asarray) @ modes.T @ modes
     correction = motions.displacement(-rigid)
     full.set_state(present + np.where(full.constrained, 0.0, correction))
     # Within an iteration the stored values may belong to another state.

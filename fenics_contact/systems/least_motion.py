@@ -43,14 +43,14 @@ def find_least_motion(
     Args:
         full: The system, at the state to change.
         motions: The rigid-body modes.
-        modes: Modes that may change, in free motions, (n_modes, n_free).
+        modes: Modes that may change, in free modes, (n_modes, n_free).
         states: Values at the points of every contact at that state.
-        displacement: Motion since the reference state, in free motions, (n_free,) (length).
+        displacement: Motion since the reference state, in free modes, (n_free,) (length).
         among: Masks of the points that count, (n_points,) each.
         closed: Reduction of the gaps since ``states``, (n_points,) each (length).
 
     Returns:
-        Change in free motions, (n_free,) (length); None if the constraints are infeasible.
+        Change in free modes, (n_free,) (length); None if the constraints are infeasible.
     """
     comm, scales = full.unknowns.comm, full.scales
     matrix = motions.present_matrix()
@@ -72,8 +72,8 @@ def find_least_motion(
         rows.append(np.column_stack([closing, limit])[is_coupled])
     limits = gather_rows(comm, np.concatenate(rows))
     mass = motions.free @ motions.gram(matrix) @ motions.free.T
-    turns = motions.free * (motions.turns > 0.0)
-    norm = modes @ (mass + _ROTATION_WEIGHT * mass.max() * turns @ turns.T)
+    rotations = motions.free * (motions.rotation_length > 0.0)
+    norm = modes @ (mass + _ROTATION_WEIGHT * mass.max() * rotations @ rotations.T)
     change = minimise_norm(norm @ modes.T, norm @ displacement, limits[:, :-1], limits[:, -1])
     change = broadcast_from_root(comm, change)
     return None if change is None else np.asarray(change @ modes, dtype=np.float64)

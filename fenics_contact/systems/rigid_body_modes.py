@@ -26,7 +26,7 @@ class RigidBodyModes(RigidMotions):
     """The free `RigidMotions`, and which of them contact constrains.
 
     Attributes:
-        free: Coefficients of the free motions, (n_free, n_motions).
+        free: Coefficients of the free modes, (n_free, n_motions).
     """
 
     def __init__(self, full: FullSystem) -> None:
@@ -66,8 +66,8 @@ class RigidBodyModes(RigidMotions):
         for vector in (work, image):
             vector.destroy()
 
-    def at_points(self, operator: ContactOperator) -> Array:
-        """Return the jumps of the free motions, (n_free, n_points, gdim). Collective."""
+    def jumps_at(self, operator: ContactOperator) -> Array:
+        """Return the jumps of the free modes, (n_free, n_points, gdim). Collective."""
         if operator not in self._jumps or operator.contact.free_angle is not None:
             gdim, n_points = len(self._centres[0]), operator.contact.quadrature.n_points
             jumps = [operator.jump(self.matrix.T @ row) for row in self.free]
@@ -75,24 +75,24 @@ class RigidBodyModes(RigidMotions):
         return self._jumps[operator]
 
     def _moved_parts(self) -> tuple[Mask, Mask]:
-        """Return masks of the bodies, (n_free, n_bodies), and obstacles that free motions move."""
+        """Return masks of the bodies, (n_free, n_bodies), and obstacles that free modes move."""
         n_per_body, moves = len(self.of_bodies), self.free != 0.0
         n_modes = self._n_bodies * n_per_body
         bodies = moves[:, :n_modes].reshape(-1, self._n_bodies, n_per_body).any(axis=2)
         return bodies, moves[:, n_modes:]
 
-    def of_same_body(self) -> Mask:
-        """Return which free motions move a common part, a mask (n_free, n_free)."""
+    def find_coupled_modes(self) -> Mask:
+        """Return which free modes move a common part, a mask (n_free, n_free)."""
         parts = np.hstack(self._moved_parts()).astype(np.float64)
         return np.asarray(parts @ parts.T > 0)
 
-    def of_any_body(self) -> Mask:
-        """Return which free motions move a body, a mask (n_free,)."""
+    def find_body_modes(self) -> Mask:
+        """Return which free modes move a body, a mask (n_free,)."""
         bodies, _ = self._moved_parts()
         return np.asarray(bodies.any(axis=1))
 
     def find_modes_of_bodies(self, bodies: Mask) -> Index:
-        """Return the numbers of the free motions that move only chosen bodies."""
+        """Return the numbers of the free modes that move only chosen bodies."""
         moves, obstacles = self._moved_parts()
         return np.flatnonzero(
             moves.any(axis=1) & ~moves[:, ~bodies].any(axis=1) & ~obstacles.any(axis=1)
@@ -118,24 +118,24 @@ class RigidBodyModes(RigidMotions):
         return np.abs(self._split(coefficients @ self.free)[0]).sum(axis=1)
 
     def present_fields(self) -> Array:
-        """Return the free motions at the present positions, (n_free, n_local)."""
+        """Return the free modes at the present positions, (n_free, n_local)."""
         return np.asarray((self.present_matrix().T @ self.free.T).T)
 
     def jumps_at_points(
         self, operators: Sequence[ContactOperator], matrix: scipy.sparse.csc_matrix
     ) -> list[Array]:
-        """Return the jumps of the free motions by contact, (n_free, n_points, gdim). Collective.
+        """Return the jumps of the free modes by contact, (n_free, n_points, gdim). Collective.
 
         ``matrix`` is the `present_matrix`.
         """
         if matrix is self.matrix:
-            return [self.at_points(operator) for operator in operators]
+            return [self.jumps_at(operator) for operator in operators]
         shape = len(self.free), -1, self._x.shape[1]
         fields = [matrix.T @ row for row in self.free]
         return [np.array([o.jump(field) for field in fields]).reshape(shape) for o in operators]
 
     def work_of_load(self, load: Array, matrix: scipy.sparse.csc_matrix) -> Array:
-        """Return the work of a load on the free motions, 0 where it is round-off. Collective.
+        """Return the work of a load on the free modes, 0 where it is round-off. Collective.
 
         Args:
             load: External forces at this rank's unknowns (force).
@@ -155,8 +155,8 @@ class RigidBodyModes(RigidMotions):
         repeats = np.append(np.full(self._n_bodies, n_per_body), np.ones(n_obstacles, dtype=int))
         return np.asarray(np.abs(self.free) @ np.repeat(sizes, repeats))
 
-    def fit(self, change: Array, part: Callable[[Array], Array]) -> Array:
-        """Fit free motions to a change of this rank's unknowns, (n_free,). Collective.
+    def fit_modes(self, change: Array, part: Callable[[Array], Array]) -> Array:
+        """Fit free modes to a change of this rank's unknowns, (n_free,). Collective.
 
         The function ``part`` selects the unknowns that are compared.
         """
@@ -166,7 +166,7 @@ class RigidBodyModes(RigidMotions):
         return np.asarray(broadcast_from_root(self.comm, coefficients), dtype=np.float64)
 
     def displacement(self, coefficients: Array) -> Array:
-        """Return the change of the unknowns, (n_local,), for free motions from the present state.
+        """Return the change of the unknowns, (n_local,), for free modes from the present state.
 
         Rotations are finite unless the bulk is linear.
         """
@@ -175,7 +175,7 @@ class RigidBodyModes(RigidMotions):
         return self.matrix.T @ all_motions if linear else self.rotate(all_motions)
 
     def is_constrained(self, operators: Sequence[ContactOperator]) -> bool:
-        """Return whether active points constrain every free motion. Collective.
+        """Return whether active points constrain every free mode. Collective.
 
         Closed points are active, and tangentially also open points with a given friction bound.
         """
@@ -188,7 +188,7 @@ class RigidBodyModes(RigidMotions):
         closed_only: bool,
         slips: bool = False,
     ) -> Array:
-        """Return the free motions that no contact constrains, (n_modes, n_free). Collective.
+        """Return the free modes that no contact constrains, (n_modes, n_free). Collective.
 
         The squared jumps are relative to the area of Γc on the bodies that a motion moves.
 
@@ -201,10 +201,10 @@ class RigidBodyModes(RigidMotions):
         n_free = len(self.free)
         gram: Array = np.zeros((n_free, n_free))
         area: Array = np.zeros(n_free)
-        same_body = self.of_same_body().astype(np.float64)
+        same_body = self.find_coupled_modes().astype(np.float64)
         for operator in operators:
             contact, values = operator.contact, operator.contact.values
-            modes = self.at_points(operator)
+            modes = self.jumps_at(operator)
             normal = np.einsum("mqd,qd->mq", modes, values.normal)
             weights = contact.quadrature.weights
             if closed_only:
@@ -291,16 +291,16 @@ class RigidBodyModes(RigidMotions):
         return broadcast_from_root(self.comm, np.concatenate(basis))
 
     def find_state_independent_modes(self) -> Index:
-        """Return the numbers of the free motions except rotations of obstacles."""
+        """Return the numbers of the free modes except rotations of obstacles."""
         return np.flatnonzero(~np.any(self.free[:, self.is_obstacle_rotation] != 0.0, axis=1))
 
     @property
     def has_obstacle_rotations(self) -> bool:
-        """Whether some free motions are rotations of obstacles, whose arms depend on the state."""
+        """Whether some free modes rotate obstacles, whose lever arms depend on the state."""
         return bool(self.is_obstacle_rotation.any())
 
     def generalised_forces(self, forces: Array) -> Array:
-        """Return the work of forces on the free motions, (n_free,). Collective."""
+        """Return the work of forces on the free modes, (n_free,). Collective."""
         return global_sum(self.comm, self.free @ (self.matrix @ forces))
 
     def load_resultant(
@@ -315,8 +315,8 @@ class RigidBodyModes(RigidMotions):
             operators: Operators of evaluated contacts, over all unknowns.
 
         Returns:
-            The generalised load, 0 where it is round-off, and a bound of its size: (n_straight,)
-            (force) each.
+            The generalised load, 0 where it is round-off, and a bound of its size, by mode of
+            `find_state_independent_modes` (force).
         """
         rows = self.find_state_independent_modes()
         sums = np.stack([self.free @ (self.matrix @ load), self._bound_work(load)])[:, rows]
@@ -325,14 +325,14 @@ class RigidBodyModes(RigidMotions):
             if not contact.law.has_normal_stiffness:
                 force = contact.measure * contact.values.parameters["pressure"]
                 normal = np.einsum(
-                    "mqd,qd->mq", self.at_points(operator)[rows], contact.values.normal
+                    "mqd,qd->mq", self.jumps_at(operator)[rows], contact.values.normal
                 )
                 sums += np.stack([-normal @ force, np.abs(normal) @ force])
         resultant, size = global_sum(self.comm, sums)
         return _without_round_off(resultant, size), size
 
     def groups(self) -> Index:
-        """Return the group of coupled parts that each free motion moves, (n_free,)."""
+        """Return the group of coupled parts that each free mode moves, (n_free,)."""
         return np.asarray(self._scales.group[np.argmax(np.hstack(self._moved_parts()), axis=1)])
 
     def generalised_load(self, load: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Rigid motions of bodies and free obstacles, at the unknowns and at contact points."""
+"""Rigid motions of bodies and obstacles, at the unknowns and at contact points."""
 
 from __future__ import annotations
 
@@ -23,20 +23,21 @@ __all__ = ["RigidMotions"]
 
 
 class RigidMotions:
-    """Translations and rotations of every body, and the free motions of obstacles.
+    """Translations and rotations of every body, and the unknown motions of obstacles.
 
     A body is a connected part of the mesh. Rotations are about its centre and scaled by its size,
     so that all motions are displacements of order one. The constructor is collective.
 
     Args:
-        full: The system; each free motion of an obstacle is one rigid motion.
+        full: The system; each unknown motion of an obstacle is one rigid motion.
 
     Attributes:
         comm: MPI communicator.
         names: Name of every motion, those of the bodies first.
-        turns: Size of the body for its rotations, whose angle times size is of order one (length);
-            0 for other motions.
-        is_obstacle_rotation: Mask of the rotations of obstacles, whose arms depend on the state.
+        rotation_length: Size of the body for its rotations, whose angle times size is of order one
+            (length); 0 for other motions.
+        is_obstacle_rotation: Mask of the rotations of obstacles, whose lever arms depend on the
+            state.
         of_bodies: Translations, then rotations, of the undeformed bodies: at each of this rank's
             unknowns those of its own body, (n_per_body, n_local).
         matrix: All motions of the undeformed bodies, sparse, (n_motions, n_local): those of the
@@ -60,7 +61,7 @@ class RigidMotions:
         obstacles = [(contact.name, m) for contact in full.contacts for m in contact.motions]
         self.names += [f"{m.kind} {m.way} of the obstacle of {name}" for name, m in obstacles]
         is_obstacle_rotation = [False] * len(lengths) + [m.turns for _, m in obstacles]
-        self.turns = np.array(lengths + [0.0] * len(obstacles))
+        self.rotation_length = np.array(lengths + [0.0] * len(obstacles))
         self.is_obstacle_rotation = np.array(is_obstacle_rotation, dtype=np.bool_)
         self.of_bodies = self._of_bodies_at(x)
         self.matrix = self._assemble_matrix(self.of_bodies)
