@@ -33,7 +33,8 @@ list(fc.increments(problem, depth, 0, DEPTH, steps=5))
 list(fc.increments(problem, angle, 0, 2 * np.pi, steps=12))
 torque = contact.moment((0.0, axis[1] - DEPTH))[0]
 # All points slip: the torque is that of the traction μ p at the radius of the drum.
-borne = msh.comm.allreduce(contact.measure @ contact.pressure)
+normal_force = msh.comm.allreduce(contact.measure @ contact.pressure)
+expected = FRICTION * RADIUS * normal_force
 if msh.comm.rank == 0:
-    print(f"torque {abs(torque):.6g} N mm/mm, μ R ∫p = {FRICTION * RADIUS * borne:.6g} N mm/mm")
-assert np.isclose(abs(torque), FRICTION * RADIUS * borne, rtol=5e-3)  # the penetration is p/k_n
+    print(f"torque {abs(torque):.6g} N mm/mm, μ R ∫p = {expected:.6g} N mm/mm")
+assert np.isclose(abs(torque), expected, rtol=5e-3)  # the penetration is p/k_n

@@ -39,8 +39,8 @@ bcs = [fem.dirichletbc(0.0, ends[0], V.sub(0)), fem.dirichletbc(depth, ends[1], 
 floor = fc.HalfSpace((0, 0), (0, 1))
 contact = fc.Contact(u, fc.ContactSurface(msh, tags, BOTTOM), floor, fc.Frictionless())
 problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
-kept = {"checkpoint": sys.argv[1], "state_fields": [plastic]} if sys.argv[1:] else {}
-for _ in fc.increments(problem, depth, 0, -DEPTH, steps=10, **kept):
+checkpoint_options = {"checkpoint": sys.argv[1], "state_fields": [plastic]} if sys.argv[1:] else {}
+for _ in fc.increments(problem, depth, 0, -DEPTH, steps=10, **checkpoint_options):
     plastic.interpolate(grown)
 force, limit = contact.resultants().normal_force, 2 / np.sqrt(3) * YIELD * WIDTH
 if msh.comm.rank == 0:

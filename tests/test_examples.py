@@ -28,10 +28,10 @@ PRINTED = {
     "block_on_floor": (r"T = {} N/mm, μ N = {} N/mm; points that stick: 0", 1e-5),
     "cam": (r"work of the torque {} mJ/mm, stored {} mJ/mm", 5e-3),
     "drum": (r"torque {} N mm/mm, μ R ∫p = {} N mm/mm", 5e-3),
-    "hysteresis": (r"friction takes {} mJ/mm a cycle; area of the loop {} mJ/mm", 1e-5),
+    "hysteresis": (r"dissipation {} mJ/mm per cycle; area of the loop {} mJ/mm", 1e-5),
     "own_law": (r"closed up by {} mm; h ln\(p/p0\) = {} mm", 1e-5),
     "plastic_block": (r"force {} N/mm, limit {} N/mm", 1e-5),
-    "roller": (r"turned by {} rad, way / R = {} rad", 1e-2),
+    "roller": (r"turned by {} rad, travel / R = {} rad", 1e-2),
     "stack": (r"plastic-brass: {} N/mm, the load is {} N/mm", 1e-9),
     "two_bodies": (r"the blocks shorten by {} mm, two springs by {} mm", 1e-5),
 }

@@ -47,11 +47,11 @@ u, v = fem.Function(V), ufl.TestFunction(V)
 body = fc.elasticity.LinearElastic(u, E, NU, kind="plane strain")
 foot = fem.locate_dofs_topological(V, 1, tags.find(BOTTOM))
 bcs = [fem.dirichletbc(np.zeros(2), foot, V)]
-press, way, moment = (fem.Constant(msh, 0.0) for _ in range(3))
+press, travel, moment = (fem.Constant(msh, 0.0) for _ in range(3))
 roller = fc.Cylinder(
     (0, RADIUS),
     RADIUS,
-    displacement=fc.Motion(force=(None, press), displacement=(way, None)),
+    displacement=fc.Motion(force=(None, press), displacement=(travel, None)),
     rotation=fc.Rotation(None, about=(0, RADIUS), moment=moment),  # the angle is unknown
 )
 surface = fc.ContactSurface(msh, tags, TOP)
@@ -61,14 +61,14 @@ law = fc.Coulomb(FRICTION)
 # begin rolling
 def creepage(traction: float) -> tuple[float, fc.Contact]:
     """Roll with a moment of traction μ P R; return the final creepage and the contact."""
-    u.x.array[:] = press.value = way.value = moment.value = 0.0
+    u.x.array[:] = press.value = travel.value = moment.value = 0.0
     contact = fc.Contact(u, surface, roller, law, kinematics="finite")
     problem = fc.ContactProblem(body.residual(v), u, bcs=bcs, contacts=[contact])
     list(fc.increments(problem, press, 0, -FORCE))
 
     def load(rolled):
         """Increase the moment along the first third of the path."""
-        way.value = rolled
+        travel.value = rolled
         moment.value = -traction * FRICTION * FORCE * RADIUS * min(1.0, 3 * rolled / ROLLED)
 
     path = [(0.0, 0.0)]

@@ -96,8 +96,8 @@ for name, obstacle in obstacles.items():
 wrong = {name: abs(force / forces["distance"] - 1) for name, force in forces.items()}
 for name, force in forces.items() if msh.comm.rank == 0 else ():
     off = np.abs(gaps[name] - gaps["distance"]).max()
-    print(f"{name}: gaps from {gaps[name].min():.1e} mm, other by {off:.0e} mm; ", end="")
-    print(f"force {force:.4f} N, other by {100 * wrong[name]:.2g} %")
+    print(f"{name}: smallest gap {gaps[name].min():.1e} mm, difference {off:.0e} mm; ", end="")
+    print(f"force {force:.4f} N, difference {100 * wrong[name]:.2g} %")
 # begin checks
 assert wrong["profile"] < 1e-4
 assert wrong["fine"] < 0.4 * wrong["coarse"] and wrong["halved"] < 0.4 * wrong["coarse"]

@@ -52,21 +52,21 @@ def press(obstacle, push):
     u, v = fem.Function(V), ufl.TestFunction(V)
     F = fc.elasticity.LinearElastic(u, E, NU, "3D").residual(v)
     top = fem.locate_dofs_topological(V, 2, tags.find(TOP))
-    held = fem.dirichletbc(np.zeros(3), top, V)
+    fixed = fem.dirichletbc(np.zeros(3), top, V)
     surface = fc.ContactSurface(msh, tags, BOTTOM, quadrature_degree=4)
     contact = fc.Contact(u, surface, obstacle, fc.Coulomb(0.2))
-    problem = fc.ContactProblem(F, u, bcs=[held], contacts=[contact])
+    problem = fc.ContactProblem(F, u, bcs=[fixed], contacts=[contact])
     for _ in fc.increments(problem, push, 0.0, 0.05, steps=2):
         pass
     return contact.resultants().force
 
 
-way = fem.Constant(msh, np.zeros(3))
+travel = fem.Constant(msh, np.zeros(3))
 
 
-def set_way(depth):
+def set_travel(depth):
     """Move the obstacle up."""
-    way.value[2] = depth
+    travel.value[2] = depth
 
 
 def to_torus(x):
@@ -75,9 +75,9 @@ def to_torus(x):
     return ufl.sqrt((rho - RING) ** 2 + (x[2] + SECTION) ** 2) - SECTION
 
 
-ring = Torus((0, 0, -SECTION), RING, SECTION, displacement=way)
-found = press(ring, set_way)
-expected = press(fc.SignedDistance(to_torus, displacement=way), set_way)
+ring = Torus((0, 0, -SECTION), RING, SECTION, displacement=travel)
+found = press(ring, set_travel)
+expected = press(fc.SignedDistance(to_torus, displacement=travel), set_travel)
 if msh.comm.rank == 0:
     print(f"force {found[2]:.6g} N; by a SignedDistance {expected[2]:.6g} N")
     assert found[2] > 0 and np.allclose(found, expected, rtol=1e-7)

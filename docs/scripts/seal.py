@@ -55,13 +55,13 @@ problem = fc.ContactProblem(rubber.residual(v, dx, q=q), w, bcs=[bonded], contac
 
 # begin history
 Path("output").mkdir(exist_ok=True)
-force, peak, taken = [0.0], [0.0], 0.0
-kept = {"csv": "output/history.csv"}
-for step in fc.increments(problem, closing, 0, CLOSING, steps=STEPS, **kept):
+force, peak, dissipation = [0.0], [0.0], 0.0
+output_options = {"csv": "output/history.csv"}
+for step in fc.increments(problem, closing, 0, CLOSING, steps=STEPS, **output_options):
     found = contact.resultants()
     force.append(found.normal_force)
     peak.append(found.max_pressure)
-    taken += step.energy.dissipation
+    dissipation += step.energy.dissipation
     if mesh.comm.rank == 0:
         print(f"closed by {step.load:.2f} mm: force {force[-1]:.3f} N/mm, ", end="")
         print(f"pressure up to {peak[-1]:.3f} MPa over {found.extents['contact'].area:.2f} mm")
@@ -77,7 +77,7 @@ stored = mesh.comm.allreduce(fem.assemble_scalar(fem.form(rubber.energy * dx)))
 volume = fem.form((ufl.det(ufl.Identity(2) + ufl.grad(u)) - 1) * dx)
 grown = mesh.comm.allreduce(fem.assemble_scalar(volume)) / (np.pi * RADIUS**2 / 2)
 if mesh.comm.rank == 0:
-    print(f"work {work:.4f} mJ/mm, stored {stored:.4f}, taken by friction {taken:.4f}")
+    print(f"work {work:.4f} mJ/mm, stored {stored:.4f}, friction dissipation {dissipation:.4f}")
     print(f"volume has grown by {grown:.1e}")
-assert np.isclose(work, stored + taken, rtol=1e-2)  # trapezoidal rule
+assert np.isclose(work, stored + dissipation, rtol=1e-2)  # trapezoidal rule
 assert abs(grown) < 1e-6
