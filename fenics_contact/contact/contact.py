@@ -82,7 +82,8 @@ class Contact(PointResults):
         displacement: The relation of u to the function that is solved for.
         surface, obstacle, law: The arguments.
         quadrature: The quadrature points of Γc.
-        history: The history variables of the last commit.
+        history: History variables from which an increment starts: a working copy of the committed
+            values, in which it may change the slip reference.
         multipliers: λ_n and λ_t of the augmented Lagrangian method; None with a penalty.
         accuracy: The `Accuracy` chosen; None if the argument was not given.
         tolerance: Largest `enforcement_error` accepted, with multipliers.

@@ -43,7 +43,7 @@ class PointResults(ABC):
         surface, law: Contact surface and contact law.
         displacement: The relation of u to the function that is solved for.
         quadrature: The quadrature points of Γc.
-        history: The committed state.
+        history: History variables from which an increment starts.
         inputs: Data of law, obstacle and contact, as UFL.
     """
 

@@ -65,7 +65,7 @@ class ContactStates:
 
     Attributes:
         committed: The committed state.
-        history: Its history variables; an increment may change the slip reference.
+        history: A working copy of its history variables, with the slip reference of the increment.
     """
 
     def __init__(
