@@ -68,27 +68,27 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             cases[item.nodeid.partition("[")[0]].append(item)
     for those in cases.values():
         if MPI.COMM_WORLD.size > 1:
-            kept = those[-1:]
+            retained = those[-1:]
         elif those[0].get_closest_marker("each"):
-            kept = _each(those)
+            retained = _each(those)
         else:
-            kept = [those[0], those[-1]]
+            retained = [those[0], those[-1]]
         for item in those:
-            if item not in kept:
+            if item not in retained:
                 item.add_marker(pytest.mark.slow)
 
 
 def _each(cases: list[pytest.Item]) -> list[pytest.Item]:
     """Return cases that include every parameter value; those with only new values come first."""
-    kept: list[pytest.Item] = []
+    retained: list[pytest.Item] = []
     seen: set[tuple[str, str]] = set()
     for enough in (set.isdisjoint, lambda values, seen: not values <= seen):
         for item in cases:
             values = {(name, repr(value)) for name, value in item.callspec.params.items()}  # type: ignore[attr-defined]
             if enough(values, seen):
-                kept.append(item)
+                retained.append(item)
                 seen |= values
-    return kept
+    return retained
 
 
 def pytest_exception_interact(report: pytest.TestReport) -> None:

@@ -26,25 +26,25 @@ def press(law=None, **contact) -> ObliqueBlockOnBall:
 @pytest.fixture(scope="module")
 def truth():
     """Return reference quantities, with multipliers to 1e-8 and 200 increments."""
-    made = press(
+    setup = press(
         fc.Coulomb(0.3, fc.RelativeStiffness(10), fc.RelativeStiffness(10)),
         enforcement="augmented",
         tolerance=1e-8,
     )
-    made.run(steps=200)
-    return quantities(made.problem)
+    setup.run(steps=200)
+    return quantities(setup.problem)
 
 
 @pytest.mark.parametrize("requested_accuracy", [*PRESETS, 3e-3])
 def test_error_is_within_the_requested_accuracy(requested_accuracy, truth):
     """Normal force, friction force and peak pressure have the requested error, on equal meshes."""
-    made = press(accuracy=requested_accuracy)
-    steps = made.run()
+    setup = press(accuracy=requested_accuracy)
+    steps = setup.run()
     accuracy = fc.Accuracy.of(requested_accuracy)
     assert len(steps) == accuracy.increments
-    found = quantities(made.problem)
+    computed = quantities(setup.problem)
     for name in ("normal force", "friction force", "peak pressure"):
-        assert abs(found[name] / truth[name] - 1) <= accuracy.error, name
+        assert abs(computed[name] / truth[name] - 1) <= accuracy.error, name
 
 
 def test_choices_are_monotonic_in_the_requested_error():
@@ -62,29 +62,29 @@ def test_choices_are_monotonic_in_the_requested_error():
 
 def test_explicit_arguments_override_the_accuracy():
     """Stiffness, enforcement, tolerance and number of increments given by the caller are used."""
-    made = press(
+    setup = press(
         fc.Coulomb(0.3, k_n=fc.RelativeStiffness(7), k_t=1e3),
         accuracy="fine",
         enforcement="penalty",
     )
-    assert made.contact.multipliers is None
-    assert float(made.contact.parameters["k_n"].value) == 7.0
-    assert float(made.contact.parameters["k_t"].value) == 1e3
-    assert made.problem.snes.getTolerances()[0] == fc.Accuracy.of("fine").rtol
-    assert len(made.run(steps=2)) == 2
+    assert setup.contact.multipliers is None
+    assert float(setup.contact.parameters["k_n"].value) == 7.0
+    assert float(setup.contact.parameters["k_t"].value) == 1e3
+    assert setup.problem.snes.getTolerances()[0] == fc.Accuracy.of("fine").rtol
+    assert len(setup.run(steps=2)) == 2
     plain = press()
     assert float(plain.contact.parameters["k_n"].value) == DEFAULT_FACTOR
     assert plain.problem.accuracy is None and plain.problem.default_increments == 1
     assert press(fc.Frictionless(), accuracy="fine").problem.default_increments == 1
-    given = press(accuracy="fine", tolerance=1e-3).contact
-    assert given.tolerance == 1e-3 and given.multipliers is not None
+    overridden = press(accuracy="fine", tolerance=1e-3).contact
+    assert overridden.tolerance == 1e-3 and overridden.multipliers is not None
 
 
 def test_accuracy_does_not_change_physical_stiffness():
     """A foundation is not a regularisation: it keeps its stiffness and has no multipliers."""
-    made = press(fc.Foundation(1e4, 1e3), accuracy="fine").contact
-    assert made.multipliers is None
-    assert float(made.parameters["k_n"].value) == 1e4
+    setup = press(fc.Foundation(1e4, 1e3), accuracy="fine").contact
+    assert setup.multipliers is None
+    assert float(setup.parameters["k_n"].value) == 1e4
 
 
 def test_strictest_contact_determines_the_solver_tolerance():
@@ -107,10 +107,10 @@ def test_recommended_mesh_has_the_requested_error():
     mesh the error may be smaller or larger.
     """
     requested_accuracy = 5e-3
-    made = press(fc.Frictionless(), accuracy=requested_accuracy)
-    made.run()
-    scene = made.scene
-    budget = fc.estimate_errors(made.problem, stress(scene.u, scene.E, scene.nu))
+    setup = press(fc.Frictionless(), accuracy=requested_accuracy)
+    setup.run()
+    scene = setup.scene
+    budget = fc.estimate_errors(setup.problem, stress(scene.u, scene.E, scene.nu))
     assert budget.wanted == requested_accuracy
     assert budget.h == pytest.approx(1 / 8, rel=1e-12)
     assert 0 < budget.h_wanted < budget.h
@@ -122,8 +122,8 @@ def test_recommended_mesh_has_the_requested_error():
     contact = {"obstacle": supporting_ball(2), "accuracy": requested_accuracy}
     problem, _ = finer.problem(fc.Frictionless(), bcs, contact=contact, method="newton")
     problem.solve()
-    again = fc.estimate_errors(problem, stress(finer.u, finer.E, finer.nu))
-    assert max(again.relative("discretisation").values()) < min(worst, 2 * requested_accuracy)
+    refined = fc.estimate_errors(problem, stress(finer.u, finer.E, finer.nu))
+    assert max(refined.relative("discretisation").values()) < min(worst, 2 * requested_accuracy)
 
 
 @pytest.mark.whole

@@ -20,7 +20,7 @@ from scenes.indented_block import AXIS, BASE, TOP, half_block, solve_indentation
 COMM = MPI.COMM_WORLD
 
 
-def slope(levels: list[fc.AdaptationLevel]) -> float:
+def convergence_exponent(levels: list[fc.AdaptationLevel]) -> float:
     """Return the exponent of the energy error over the number of dofs."""
     dofs, errors = [level.dofs for level in levels], [level.budget.energy for level in levels]
     return float(np.polyfit(np.log(dofs), np.log(errors), 1)[0])
@@ -36,8 +36,8 @@ def test_convergence_rate_of_the_energy_error():
     """
     adapted = list(fc.adapt(*half_block(4), solve_indentation, levels=9))
     uniform = list(fc.adapt(*half_block(4), solve_indentation, levels=4, share=1.0))
-    assert slope(adapted[1:]) == pytest.approx(-1.0, abs=0.15)
-    assert slope(uniform) > -0.78
+    assert convergence_exponent(adapted[1:]) == pytest.approx(-1.0, abs=0.15)
+    assert convergence_exponent(uniform) > -0.78
     as_good = next(a for a in adapted if a.budget.energy <= uniform[-1].budget.energy)
     assert as_good.dofs < uniform[-1].dofs / 4
     last = adapted[-1].budget
@@ -61,15 +61,15 @@ def test_tags_and_increments_are_transferred_to_refined_meshes():
 def test_new_nodes_are_on_the_curved_side():
     """With `snap` new nodes have the inner radius of a ring to round-off (1e-14)."""
 
-    def bent(x):
+    def bend(x):
         return np.column_stack([(1 + x[:, 1]) * np.cos(x[:, 0]), (1 + x[:, 1]) * np.sin(x[:, 0])])
 
-    def onto(x):
+    def project(x):
         return x / np.linalg.norm(x, axis=1)[:, None]
 
     mesh, _ = block_mesh("triangle", n=4)
     tags = side_tags(mesh, np.ones(2))
-    mesh.geometry.x[:, :2] = bent(mesh.geometry.x[:, :2])
+    mesh.geometry.x[:, :2] = bend(mesh.geometry.x[:, :2])
 
     def solve(mesh, tags):
         V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
@@ -84,7 +84,7 @@ def test_new_nodes_are_on_the_curved_side():
         problem.solve()
         return problem, body.stress, body.strain(u)
 
-    last = list(fc.adapt(mesh, tags, solve, levels=3, snap={INSIDE: onto}))[-1]
+    last = list(fc.adapt(mesh, tags, solve, levels=3, snap={INSIDE: project}))[-1]
     sides, radius = last.facet_tags.find(INSIDE), np.ones(0)
     if sides.size:
         nodes = dolfinx.mesh.entities_to_geometry(last.mesh, 1, sides).ravel()

@@ -25,21 +25,21 @@ COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
-def rubbed(cell):
+def sheared_block(cell):
     """Return the problem of a block that is pressed and sheared, and the block's stress."""
-    made = BlockOnBall(cell=cell)
-    made.problem.small_displacement_tolerance = np.inf
-    scene = made.scene
+    setup = BlockOnBall(cell=cell)
+    setup.problem.small_displacement_tolerance = np.inf
+    scene = setup.scene
     if dimension(cell) == 3:
-        return made, stress(scene.u, scene.E, scene.nu)
-    return made, fc.elasticity.LinearElastic(scene.u, scene.E, scene.nu, "plane strain").stress
+        return setup, stress(scene.u, scene.E, scene.nu)
+    return setup, fc.elasticity.LinearElastic(scene.u, scene.E, scene.nu, "plane strain").stress
 
 
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
 def test_every_frame_shows_one_state(cell, tmp_path, monkeypatch):
     """Every frame shows the deformed body of its step, with common colours, axes and legend."""
     folder = shared_folder(tmp_path)
-    made, sigma = rubbed(cell)
+    setup, sigma = sheared_block(cell)
     bodies, colours, axes, figures = [], [], [], []
     polygons, create_axes, colour_scale = (
         drawing.polygons,
@@ -47,25 +47,25 @@ def test_every_frame_shows_one_state(cell, tmp_path, monkeypatch):
         drawing.colour_scale,
     )
 
-    def drawn(corners, faces, *rest):
+    def record_polygons(corners, faces, *rest):
         if not isinstance(faces, str):  # the faces of obstacles are strings
             bodies.append(corners)
             colours.append(faces)
         return polygons(corners, faces, *rest)
 
-    def framed(places, *rest):
+    def record_axes(places, *rest):
         axes.append(places.reshape(-1, places.shape[-1]))
-        made = create_axes(places, *rest)
-        figures.append(made[0])
-        return made
+        result = create_axes(places, *rest)
+        figures.append(result[0])
+        return result
 
-    monkeypatch.setattr(drawing, "polygons", drawn)
-    monkeypatch.setattr(drawing, "create_axes", framed)
+    monkeypatch.setattr(drawing, "polygons", record_polygons)
+    monkeypatch.setattr(drawing, "create_axes", record_axes)
     film = fc.Animation(
-        folder / "new" / "film.gif", made.problem, stress=sigma, magnification=2.0, rate=4.0
+        folder / "new" / "film.gif", setup.problem, stress=sigma, magnification=2.0, rate=4.0
     )
-    shape_of, shapes = drawing.ShapeEvaluator(made.scene.u, sigma), []
-    for step in fc.increments(made.problem, made.load, 0, 2, steps=4):
+    shape_of, shapes = drawing.ShapeEvaluator(setup.scene.u, sigma), []
+    for step in fc.increments(setup.problem, setup.load, 0, 2, steps=4):
         film.add(step)
         shapes.append(shape_of())
     film.save()
@@ -85,10 +85,10 @@ def test_every_frame_shows_one_state(cell, tmp_path, monkeypatch):
         assert np.array_equal(places.min(axis=0), everything.min(axis=0))
         assert np.array_equal(places.max(axis=0), everything.max(axis=0))
         (legend,) = figures[0].legends
-        told = ["displacement × 2"]
-        told += ["open", "sticking", "slipping"] if dimension(cell) == 2 else []
-        told.append("rigid obstacle")
-        assert [text.get_text() for text in legend.get_texts()] == told
+        labels = ["displacement × 2"]
+        labels += ["open", "sticking", "slipping"] if dimension(cell) == 2 else []
+        labels.append("rigid obstacle")
+        assert [text.get_text() for text in legend.get_texts()] == labels
 
     check_on_first_rank(check)
     del film
@@ -100,11 +100,11 @@ def test_every_frame_shows_one_state(cell, tmp_path, monkeypatch):
 def test_invalid_input_is_refused(tmp_path):
     """Invalid input raises on all ranks, and no file is written."""
     folder = shared_folder(tmp_path)
-    made, sigma = rubbed("triangle")
-    problem, path = made.problem, folder / "film.gif"
+    setup, sigma = sheared_block("triangle")
+    problem, path = setup.problem, folder / "film.gif"
     for call, *words in (
         (lambda: fc.Animation(folder / "film.mp4", problem), "film.mp4", ".gif"),
-        (lambda: fc.Animation(path, made.contact), "problem", "Contact"),
+        (lambda: fc.Animation(path, setup.contact), "problem", "Contact"),
         (lambda: fc.Animation(path, problem, magnification=0), "magnification is 0"),
         (lambda: fc.Animation(path, problem, rate="fast"), "rate is 'fast'"),
         (lambda: fc.Animation(path, problem, view=3.0), "view is 3.0"),
@@ -120,19 +120,19 @@ def test_invalid_input_is_refused(tmp_path):
 def test_failed_save_leaves_the_previous_file(tmp_path, monkeypatch):
     """If a frame cannot be drawn, all ranks raise, and the file is unchanged."""
     folder = shared_folder(tmp_path)
-    made, _ = rubbed("triangle")
-    film = fc.Animation(folder / "film.gif", made.problem)
+    setup, _ = sheared_block("triangle")
+    film = fc.Animation(folder / "film.gif", setup.problem)
     film.add("at rest")
     film.save()
     COMM.barrier()
     before = (folder / "film.gif").read_bytes()
     film.add("again")
 
-    def failing(*arguments):
+    def raise_error(*arguments):
         raise OSError("no more ink")
 
     with monkeypatch.context() as patch:
-        patch.setattr(drawing, "polygons", failing)
+        patch.setattr(drawing, "polygons", raise_error)
         assert_raised_on_all_ranks(film.save, OSError, "no more ink")
     COMM.barrier()
     assert (folder / "film.gif").read_bytes() == before

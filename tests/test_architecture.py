@@ -14,7 +14,7 @@ ROOT = PACKAGE.parent
 FOLDERS = ("demos", "examples", "scenes", "tests", "benchmarks", "verification", "docs")
 OTHERS = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 # Layers from the lowest to the highest; a layer may import from itself and from lower ones.
-ROOMS = [
+LAYERS = [
     "laws",
     "obstacles",
     "surface",
@@ -33,9 +33,9 @@ ROOMS = [
     "__main__",
 ]
 # Solution methods must not depend on the checks that verify their solutions.
-APART = {"methods": {"checks"}}
+FORBIDDEN_LAYERS = {"methods": {"checks"}}
 # Base modules, which belong to no layer and import from none.
-GROUND = {
+BASE_MODULES = {
     *("compat", "parallel", "types", "meshes", "joining", "arguments", "elasticity", "markup"),
     *("_version", "compiling", "installation", "tolerances", "wording"),
 }
@@ -63,7 +63,7 @@ def name(path: Path) -> str:
     return ".".join(part for part in parts if part != "__init__")
 
 
-def imported(source: str) -> Iterator[str]:
+def imported_modules(source: str) -> Iterator[str]:
     """Yield modules of the package that a source imports anywhere; "" is the package itself.
 
     Relative imports are yielded as they are written, and so belong to no layer.
@@ -72,94 +72,107 @@ def imported(source: str) -> Iterator[str]:
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.ImportFrom) and node.level:
             yield "." * node.level + (node.module or "")
-        elif isinstance(node, ast.ImportFrom) and within(node.module or ""):
+        elif isinstance(node, ast.ImportFrom) and is_in_package(node.module or ""):
             module = (node.module or "").removeprefix("fenics_contact").removeprefix(".")
             for alias in node.names:
-                whole = f"{module}.{alias.name}".removeprefix(".")
-                yield whole if whole in known else module
+                submodule = f"{module}.{alias.name}".removeprefix(".")
+                yield submodule if submodule in known else module
         elif isinstance(node, ast.Import):
             for alias in node.names:
-                if within(alias.name):
+                if is_in_package(alias.name):
                     yield alias.name.removeprefix("fenics_contact").removeprefix(".")
 
 
-def within(module: str) -> bool:
+def is_in_package(module: str) -> bool:
     """Return whether a module is the package or a part of it."""
     return module.split(".")[0] == "fenics_contact"
 
 
-def upwards(room: str, source: str) -> set[str]:
+def forbidden_imports(layer: str, source: str) -> set[str]:
     """Return layers that a source in a layer imports from against the rules."""
-    allowed = {*GROUND} if room in GROUND else {*GROUND, *ROOMS[: ROOMS.index(room) + 1]}
-    allowed -= APART.get(room, set())
-    return {module.split(".")[0] or module for module in imported(source)} - allowed
+    allowed = (
+        {*BASE_MODULES}
+        if layer in BASE_MODULES
+        else {*BASE_MODULES, *LAYERS[: LAYERS.index(layer) + 1]}
+    )
+    allowed -= FORBIDDEN_LAYERS.get(layer, set())
+    return {module.split(".")[0] or module for module in imported_modules(source)} - allowed
 
 
-def circle(needs: Mapping[str, set[str]]) -> set[str]:
+def circular_imports(needs: Mapping[str, set[str]]) -> set[str]:
     """Return modules that cannot be ordered so that each imports only modules before it."""
-    left = dict(needs)
-    while left:
-        ready = {module for module, others in left.items() if not others & left.keys()}
+    remaining = dict(needs)
+    while remaining:
+        ready = {module for module, others in remaining.items() if not others & remaining.keys()}
         if not ready:
-            return set(left)
-        left = {module: others for module, others in left.items() if module not in ready}
+            return set(remaining)
+        remaining = {module: others for module, others in remaining.items() if module not in ready}
     return set()
 
 
 def test_every_module_belongs_to_a_layer():
     """Every module is in a layer or is a base module."""
     places = {name(path).split(".")[0] for path in MODULES} - {""}
-    assert places == {*ROOMS, *GROUND}
+    assert places == {*LAYERS, *BASE_MODULES}
 
 
-def offences(paths: list[Path], find: Callable[[Path], Collection[str]]) -> dict[str, list[str]]:
+def violations_by_file(
+    paths: list[Path], find: Callable[[Path], Collection[str]]
+) -> dict[str, list[str]]:
     """Return the violations by file, for files that have any."""
-    found = {str(path.relative_to(ROOT)): sorted(find(path)) for path in paths}
-    return {path: what for path, what in found.items() if what}
+    violations = {str(path.relative_to(ROOT)): sorted(find(path)) for path in paths}
+    return {path: lines for path, lines in violations.items() if lines}
 
 
 def test_imports_go_to_lower_layers_only():
     """A layer imports from itself and lower ones; base modules import base modules only."""
     placed = [path for path in MODULES if name(path)]
-    assert not offences(placed, lambda path: upwards(name(path).split(".")[0], path.read_text()))
+    assert not violations_by_file(
+        placed, lambda path: forbidden_imports(name(path).split(".")[0], path.read_text())
+    )
 
 
 def test_no_circular_imports():
     """Imports have no cycle, including imports inside of functions."""
-    assert not circle({name(p): set(imported(p.read_text())) - {name(p)} for p in MODULES})
+    assert not circular_imports(
+        {name(p): set(imported_modules(p.read_text())) - {name(p)} for p in MODULES}
+    )
 
 
-def private(node: ast.AST) -> str:
+def private_name(node: ast.AST) -> str:
     """Return the private name that a node accesses, as an attribute or a string, or ""."""
-    asked = ""
+    accessed = ""
     if isinstance(node, ast.Attribute):
-        asked = node.attr
+        accessed = node.attr
     elif isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
         of = ast.unparse(node.value)
-        asked = str(node.slice.value) if of.endswith("__dict__") or of.startswith("vars(") else ""
+        accessed = (
+            str(node.slice.value) if of.endswith("__dict__") or of.startswith("vars(") else ""
+        )
     elif isinstance(node, ast.Call):
         called = ast.unparse(node.func).split(".")[-1]
-        given = [a.value for a in node.args if isinstance(a, ast.Constant)]
+        constants = [a.value for a in node.args if isinstance(a, ast.Constant)]
         if called.endswith("attr") or called in ("attrgetter", "methodcaller"):
-            asked = next((value for value in given if isinstance(value, str)), "")
-        asked = asked if asked != asked.upper() else ""  # a test may set a constant of a module
-    return asked if re.match("_[A-Za-z]", asked) else ""
+            accessed = next((value for value in constants if isinstance(value, str)), "")
+        # A test may set a constant of a module.
+        accessed = accessed if accessed != accessed.upper() else ""
+    return accessed if re.match("_[A-Za-z]", accessed) else ""
 
 
-def touched(source: str, foreign: set[str]) -> list[str]:
+def private_accesses(source: str, foreign: set[str]) -> list[str]:
     """Return accesses to private members of other objects, and imports of private names."""
     tree = ast.parse(source)
     classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
     allowed = {node for each in classes for node in members(each)}
-    asked = [
+    accesses = [
         f"line {node.lineno}: {ast.unparse(node)}"
         for node in ast.walk(tree)
-        if private(node) and node not in allowed and private(node) not in foreign
+        if private_name(node) and node not in allowed and private_name(node) not in foreign
     ]
-    return asked + [
+    return accesses + [
         f"line {node.lineno}: {alias.name}"
         for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom) and within(node.module or "")
+        if isinstance(node, ast.ImportFrom) and is_in_package(node.module or "")
         for alias in node.names
         if re.match("_[A-Za-z]", alias.name)
     ]
@@ -168,109 +181,130 @@ def touched(source: str, foreign: set[str]) -> list[str]:
 def members(of: ast.ClassDef) -> Iterator[ast.AST]:
     """Yield accesses of a class to its own members, of self or of annotated arguments."""
     nodes = list(ast.walk(of))
-    given = {
+    owned = {
         argument.arg
         for argument in nodes
         if isinstance(argument, ast.arg) and argument.annotation is not None
         if ast.unparse(argument.annotation) in (of.name, "Self")
     }
     for node in nodes:
-        if isinstance(node, ast.Attribute) and private(node):
+        if isinstance(node, ast.Attribute) and private_name(node):
             whose = node.value
-            made = isinstance(whose, ast.Call) and ast.unparse(whose.func) in (of.name, "super")
-            if made or ast.unparse(whose) in {"self", "cls", "this", of.name, *given}:
+            is_own_class = isinstance(whose, ast.Call) and ast.unparse(whose.func) in (
+                of.name,
+                "super",
+            )
+            if is_own_class or ast.unparse(whose) in {"self", "cls", "this", of.name, *owned}:
                 yield node
 
 
 def test_private_members_are_used_by_their_class_only():
     """`x._y` is allowed for self, and for other instances in the body of their class."""
-    own, others = OF_DOLFINX | OF_NOTEBOOKS, OF_DOLFINX | OF_NOTEBOOKS | OF_MATPLOTLIB
-    assert not offences(MODULES, lambda path: touched(path.read_text(), own))
-    assert not offences(OTHERS, lambda path: touched(path.read_text(), others))
+    allowed_names, others = OF_DOLFINX | OF_NOTEBOOKS, OF_DOLFINX | OF_NOTEBOOKS | OF_MATPLOTLIB
+    assert not violations_by_file(
+        MODULES, lambda path: private_accesses(path.read_text(), allowed_names)
+    )
+    assert not violations_by_file(OTHERS, lambda path: private_accesses(path.read_text(), others))
 
 
-def made_findable(source: str) -> bool:
+def changes_search_path(source: str) -> bool:
     """Return whether a source changes the module search path."""
     return bool(re.search(r"sys\.path\b|from sys import .*\bpath\b|\baddsitedir\b", source))
 
 
 def imported_tests(source: str) -> list[str]:
     """Return test modules that a source imports, or imports from."""
-    found = []
+    imports = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names]
+            imports += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
-            found += [f"{node.module or ''}.{alias.name}" for alias in node.names]
-    return [each for each in found if re.search(r"(^|\.)(tests|test_\w+|conftest)(\.|$)", each)]
+            imports += [f"{node.module or ''}.{alias.name}" for alias in node.names]
+    return [each for each in imports if re.search(r"(^|\.)(tests|test_\w+|conftest)(\.|$)", each)]
 
 
 def test_scripts_import_installed_packages_only():
     """Only scripts of the documentation change the search path; no test imports another."""
     may = ("conf.py", "test_docs.py", "test_architecture.py")
-    assert not [p for p in OTHERS if p.name not in may and made_findable(p.read_text())]
-    assert not offences(OTHERS, lambda path: imported_tests(path.read_text()))
+    assert not [p for p in OTHERS if p.name not in may and changes_search_path(p.read_text())]
+    assert not violations_by_file(OTHERS, lambda path: imported_tests(path.read_text()))
 
 
-def anything(source: str) -> list[str]:
+def annotations_as_any(source: str) -> list[str]:
     """Return arguments and attributes annotated as Any although the package has a class."""
-    found = []
+    violations = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.arg):
-            what, annotation = node.arg, node.annotation
+            argument, annotation = node.arg, node.annotation
         elif isinstance(node, ast.AnnAssign):
-            what, annotation = ast.unparse(node.target).split(".")[-1], node.annotation
+            argument, annotation = ast.unparse(node.target).split(".")[-1], node.annotation
         else:
             continue
         kinds = (
             set() if annotation is None else set(re.split(r"[ |\[\]]+", ast.unparse(annotation)))
         )
-        if what.lstrip("_") in KNOWN and kinds <= {"Any", "typing.Any", "None", "Optional", ""}:
-            found += [f"line {node.lineno}: {what}"] if kinds else []
-    return found
+        if argument.lstrip("_") in KNOWN and kinds <= {"Any", "typing.Any", "None", "Optional", ""}:
+            violations += [f"line {node.lineno}: {argument}"] if kinds else []
+    return violations
 
 
 def test_known_classes_are_not_annotated_as_any():
     """No argument or attribute for which the package has a class is annotated as `Any`."""
-    assert not offences(MODULES, lambda path: anything(path.read_text()))
+    assert not violations_by_file(MODULES, lambda path: annotations_as_any(path.read_text()))
 
 
 BROKEN = {
-    "a room above": lambda: upwards("laws", "from fenics_contact.contact.contact import Contact"),
-    "a room above, by name": lambda: upwards("surface", "from fenics_contact import problem"),
-    "a room above, late": lambda: upwards(
+    "a layer above": lambda: forbidden_imports(
+        "laws", "from fenics_contact.contact.contact import Contact"
+    ),
+    "a layer above, by name": lambda: forbidden_imports(
+        "surface", "from fenics_contact import problem"
+    ),
+    "a layer above, in a function": lambda: forbidden_imports(
         "checks", "def f():\n    import fenics_contact.methods.solver"
     ),
-    "a room apart": lambda: upwards("methods", "from fenics_contact.checks import verifier"),
-    "a room from the ground": lambda: upwards("compat", "import fenics_contact.laws.base"),
-    "the whole package": lambda: upwards("problem", "import fenics_contact as fc"),
-    "a name of the whole package": lambda: upwards("histories", "from fenics_contact import Law"),
-    "a neighbour without its room": lambda: upwards("methods", "from ..problem import x"),
-    "a circle": lambda: circle({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": set()}),
-    "a private member": lambda: touched("class A:\n    def f(self, b):\n        b._c", set()),
-    "one that the class has, too": lambda: touched(
+    "a forbidden layer": lambda: forbidden_imports(
+        "methods", "from fenics_contact.checks import verifier"
+    ),
+    "a layer from a base module": lambda: forbidden_imports(
+        "compat", "import fenics_contact.laws.base"
+    ),
+    "the whole package": lambda: forbidden_imports("problem", "import fenics_contact as fc"),
+    "a name of the whole package": lambda: forbidden_imports(
+        "histories", "from fenics_contact import Law"
+    ),
+    "a relative import": lambda: forbidden_imports("methods", "from ..problem import x"),
+    "a circular import": lambda: circular_imports({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": set()}),
+    "a private member": lambda: private_accesses(
+        "class A:\n    def f(self, b):\n        b._c", set()
+    ),
+    "one that the class has, too": lambda: private_accesses(
         "class A:\n    def f(self, b: B):\n        self._c = b._c", set()
     ),
-    "one of a member": lambda: touched("class A:\n    def f(self):\n        self.b._c", set()),
-    "one by its name": lambda: touched("getattr(a, '_b')", set()),
-    "one of its dictionary": lambda: touched("vars(a)['_b'] = 1", set()),
-    "a private function": lambda: touched("from fenics_contact.laws.base import _f", set()),
-    "a path": lambda: made_findable("import sys\nsys.path.insert(0, '.')"),
-    "a path by another name": lambda: made_findable("from sys import argv, path"),
+    "one of a member": lambda: private_accesses(
+        "class A:\n    def f(self):\n        self.b._c", set()
+    ),
+    "one by its name": lambda: private_accesses("getattr(a, '_b')", set()),
+    "one of its dictionary": lambda: private_accesses("vars(a)['_b'] = 1", set()),
+    "a private function": lambda: private_accesses(
+        "from fenics_contact.laws.base import _f", set()
+    ),
+    "a path": lambda: changes_search_path("import sys\nsys.path.insert(0, '.')"),
+    "a path by another name": lambda: changes_search_path("from sys import argv, path"),
     "a test": lambda: imported_tests("from test_solver import scene"),
     "a test as a module": lambda: imported_tests("import test_solver"),
     "a test of the folder": lambda: imported_tests("from tests import test_solver"),
     "a name of a test": lambda: imported_tests("from tests.test_solver import scene"),
-    "an argument": lambda: anything("def f(problem: Any): ..."),
-    "an argument or none": lambda: anything("def f(*, contact: Any | None = None): ..."),
-    "an attribute": lambda: anything("class A:\n    system: Any"),
-    "a private attribute": lambda: anything("self._problem: Optional[Any] = None"),
+    "an argument": lambda: annotations_as_any("def f(problem: Any): ..."),
+    "an argument or none": lambda: annotations_as_any("def f(*, contact: Any | None = None): ..."),
+    "an attribute": lambda: annotations_as_any("class A:\n    system: Any"),
+    "a private attribute": lambda: annotations_as_any("self._problem: Optional[Any] = None"),
 }
 
 
 def test_violations_of_the_rules_are_detected():
     """Every violation in ``BROKEN`` is detected."""
-    assert not [how for how, found in BROKEN.items() if not found()]
+    assert not [rule for rule, is_detected in BROKEN.items() if not is_detected()]
 
 
 def test_names_that_depend_on_the_release_come_from_compat():
@@ -288,7 +322,7 @@ def test_names_that_depend_on_the_release_come_from_compat():
 
 
 @cache
-def exported(path: Path) -> set[str]:
+def exported_names(path: Path) -> set[str]:
     """Return the names in ``__all__`` of a module."""
     for node in ast.parse(path.read_text()).body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
@@ -296,51 +330,51 @@ def exported(path: Path) -> set[str]:
     return set()
 
 
-def not_exported(path: Path) -> list[str]:
+def unexported_names(path: Path) -> list[str]:
     """Return imported names that are not in ``__all__``, and private names in its own."""
-    said = {name(p): exported(p) for p in MODULES}
-    tree, modules, unsaid = ast.parse(path.read_text()), {}, []
+    exported = {name(p): exported_names(p) for p in MODULES}
+    tree, modules, unexported = ast.parse(path.read_text()), {}, []
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("fenics_contact"):
             module = (node.module or "").removeprefix("fenics_contact").removeprefix(".")
             for alias in node.names:
-                whole = f"{module}.{alias.name}".removeprefix(".")
-                if whole in said:
-                    modules[alias.asname or alias.name] = whole
-                elif alias.name not in said[module]:
-                    unsaid.append(whole)
+                module_name = f"{module}.{alias.name}".removeprefix(".")
+                if module_name in exported:
+                    modules[alias.asname or alias.name] = module_name
+                elif alias.name not in exported[module]:
+                    unexported.append(module_name)
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             module = modules.get(node.value.id)
-            if module is not None and node.attr not in said[module]:
-                unsaid.append(f"{module}.{node.attr}")
-    return unsaid + [n for n in said[name(path)] if re.match("_[a-z]", n)]
+            if module is not None and node.attr not in exported[module]:
+                unexported.append(f"{module}.{node.attr}")
+    return unexported + [n for n in exported[name(path)] if re.match("_[a-z]", n)]
 
 
 def test_imported_names_are_in_all():
     """Names imported, or accessed by module, are in ``__all__``, which has no private names."""
-    assert not offences(MODULES, not_exported)
+    assert not violations_by_file(MODULES, unexported_names)
 
 
-def made_in_constructor(of: ast.ClassDef, known: dict[str, ast.ClassDef]) -> set[str]:
+def constructor_attributes(of: ast.ClassDef, known: dict[str, ast.ClassDef]) -> set[str]:
     """Return attributes that a class or its bases in the package define on construction."""
-    found = set()
+    attributes = set()
     for part in of.body:
         if isinstance(part, ast.FunctionDef) and part.name == "__init__":
-            found |= set(set_on_self(part))
+            attributes |= set(attributes_set_on_self(part))
         if isinstance(part, ast.FunctionDef) and part.decorator_list:
-            found.add(part.name)  # a property
+            attributes.add(part.name)  # a property
         if isinstance(part, ast.AnnAssign) and any(
             "dataclass" in ast.unparse(decorator) for decorator in of.decorator_list
         ):
-            found.add(ast.unparse(part.target))
+            attributes.add(ast.unparse(part.target))
     for base in of.bases:
         if ast.unparse(base) in known:
-            found |= made_in_constructor(known[ast.unparse(base)], known)
-    return found
+            attributes |= constructor_attributes(known[ast.unparse(base)], known)
+    return attributes
 
 
-def set_on_self(function: ast.FunctionDef) -> Iterator[str]:
+def attributes_set_on_self(function: ast.FunctionDef) -> Iterator[str]:
     """Yield attributes of self that a function assigns or declares."""
     for node in ast.walk(function):
         if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
@@ -357,11 +391,11 @@ def test_attributes_are_defined_in_the_constructor():
         if isinstance(node, ast.ClassDef)
     ]
     known = {one.name: one for one in classes}
-    late = {
+    defined_later = {
         f"{one.name}.{attribute}, in {part.name}"
         for one in classes
         for part in one.body
         if isinstance(part, ast.FunctionDef)
-        for attribute in set(set_on_self(part)) - made_in_constructor(one, known)
+        for attribute in set(attributes_set_on_self(part)) - constructor_attributes(one, known)
     }
-    assert not late
+    assert not defined_later

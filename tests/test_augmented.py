@@ -94,7 +94,7 @@ LAWS = {
 PATH = [(0.0, 0.02), (0.004, 0.02), (0.012, 0.02), (-0.002, 0.02), (-0.002, -0.01)]
 
 
-def walk(law: str, stiffness: fc.RelativeStiffness, path=PATH, **options):
+def solve_path(law: str, stiffness: fc.RelativeStiffness, path=PATH, **options):
     """Solve a block whose top follows the path, on a convex floor; return results and contact."""
     d, make = LAWS[law]
     cell, n = ("quadrilateral", (6, 3)) if d == 2 else ("hexahedron", (3, 3, 2))
@@ -103,7 +103,7 @@ def walk(law: str, stiffness: fc.RelativeStiffness, path=PATH, **options):
     bcs = [fem.dirichletbc(move, scene.facet_dofs(TOP), scene.u.function_space)]
     contact = {"obstacle": parabolic_floor(scene), **options}
     problem, contact = scene.problem(make(stiffness), bcs, contact=contact, method="newton")
-    found = []
+    computed = []
     for side, down in path:
         move.value[:] = scene.vector(side=side, up=-down)
         if d == 3:
@@ -111,8 +111,8 @@ def walk(law: str, stiffness: fc.RelativeStiffness, path=PATH, **options):
         step = problem.solve()
         problem.commit()
         fields = contact.traction, contact.slip
-        found.append((step, *(point_values(contact, f) for f in fields)))
-    return found, contact
+        computed.append((step, *(point_values(contact, f) for f in fields)))
+    return computed, contact
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="of the laws; ranks are compared below")
@@ -124,19 +124,19 @@ def test_limit_of_the_penalty(law: str) -> None:
     whose error is its elastic displacement, about 1e-5 of the body's. Tolerance 1e-3 of the
     largest traction and slip of the path; the error of the penalty at 10 E/h is above 1e-2.
     """
-    augmented, _ = walk(law, SOFT, **AUGMENTED)
-    stiff, _ = walk(law, STIFF)
-    soft, _ = walk(law, SOFT)
+    augmented, _ = solve_path(law, SOFT, **AUGMENTED)
+    stiff, _ = solve_path(law, STIFF)
+    soft, _ = solve_path(law, SOFT)
     for i in (1, 2):
         exact = [s[i] for s in stiff]
         scale = max(np.abs(e).max(initial=0.0) for e in exact)
-        ours, theirs = (
+        multiplier_force, penalty_force = (
             max(np.abs(s[i] - e).max(initial=0.0) for s, e in zip(run, exact, strict=True))
             for run in (augmented, soft)
         )
         if scale > 0:
-            assert ours <= 1e-3 * scale
-            assert theirs > 1e-2 * scale
+            assert multiplier_force <= 1e-3 * scale
+            assert penalty_force > 1e-2 * scale
     assert all(not step.verdict.failures for step, *_ in augmented)
 
 
@@ -151,13 +151,15 @@ def test_half_cylinder() -> None:
     iterations are at most 1.5 times those of the penalty at 10 E/h, and fewer than at 1e6 E/h.
     """
     body = problems.half_cylinder(0.0, 0.1, grading=0.1, coarsest=0.5)
-    found = []
+    computed = []
     for k, options in ((10.0, {}), (10.0, AUGMENTED), (1e6, {})):
         problem, _, u, load = problems.problem(body, 2, k, contact_options=options)
         load.value = body.final_load
         step = problem.solve()
-        found.append((body.displacement(u), step.contacts["contact"].max_pressure, step.iterations))
-    penalty, augmented, rigid = found
+        computed.append(
+            (body.displacement(u), step.contacts["contact"].max_pressure, step.iterations)
+        )
+    penalty, augmented, rigid = computed
     assert augmented[0] == pytest.approx(-0.5181, abs=1e-4)
     assert augmented[1] == pytest.approx(142.6, abs=0.1)
     assert augmented[0] == pytest.approx(-0.518147, rel=5e-5)
@@ -170,19 +172,19 @@ def test_half_cylinder() -> None:
 @pytest.mark.parametrize("degree", [1, 2])
 def test_default_quadrature_of_multipliers(degree: int) -> None:
     """Multipliers of linear elements default to vertex quadrature, all others to Gauss points."""
-    for given, options, wanted in (
+    for degree_given, options, expected in (
         ({}, AUGMENTED, 2 if degree == 1 else 3),
         ({"quadrature_degree": 3}, AUGMENTED, 2),
         ({"quadrature_scheme": "default"}, AUGMENTED, degree + 1),
         ({}, {}, degree + 1),
     ):
-        scene = block("quadrilateral", degree, surface=given)
+        scene = block("quadrilateral", degree, surface=degree_given)
         contact = scene.contact(fc.Frictionless(k_n=1.0), **options)
         contact.evaluate()
         per_facet = COMM.allreduce(len(contact.points)) / COMM.allreduce(len(scene.surface.facets))
-        assert per_facet == wanted
+        assert per_facet == expected
         corner = np.abs(gather(COMM, contact.points)[:, 0]).min() < 1e-12
-        assert corner == (not given and bool(options) and degree == 1)
+        assert corner == (not degree_given and bool(options) and degree == 1)
 
 
 # ---- stick ---------------------------------------------------------------------------------------
@@ -202,16 +204,16 @@ def test_cyclic_shear_below_the_friction_bound_leaves_no_slip(degree: int) -> No
     scene = block("quadrilateral", degree, nu=0.0, n=3, up=-10.0)
     k_t = 1e4
     problem, contact = scene.problem(fc.Coulomb(1.0, k_n=1e4, k_t=k_t), [], contact=AUGMENTED)
-    moved, felt = [], []
+    moved, shear_forces = [], []
     for i in range(12):
         scene.load(up=-10.0, side=np.cos(i))
         problem.solve()
         problem.commit()
         moved.append(np.abs(gather(COMM, contact.tangential_displacement)).max())
-        felt.append(np.abs(gather(COMM, contact.tangential_traction)).max())
+        shear_forces.append(np.abs(gather(COMM, contact.tangential_traction)).max())
         assert np.all(gather(COMM, contact.status) == fc.Status.STICK)
-    assert max(felt) > 0.9
-    assert max(moved) <= (2 * 1e-5 * 16.0 if degree == 1 else 0.05 * max(felt)) / k_t
+    assert max(shear_forces) > 0.9
+    assert max(moved) <= (2 * 1e-5 * 16.0 if degree == 1 else 0.05 * max(shear_forces)) / k_t
     assert max(moved[6:]) <= 1.5 * max(moved[:6])
 
 
@@ -301,9 +303,9 @@ def test_augmentation_with_very_soft_springs(degree: int) -> None:
         scene = block("quadrilateral", degree, n=6)
         shift = fem.Constant(scene.mesh, np.zeros(2))
         law = fc.Coulomb(0.3, k_n=fc.RelativeStiffness(k), k_t=fc.RelativeStiffness(k))
-        held = [scene.dirichlet_bc(TOP, i) for i in range(2)]
-        given = AUGMENTED | {"displacement": shift}
-        problem, contact = scene.problem(law, held, contact=given)
+        bcs = [scene.dirichlet_bc(TOP, i) for i in range(2)]
+        options = AUGMENTED | {"displacement": shift}
+        problem, contact = scene.problem(law, bcs, contact=options)
         for side in (0.0, 0.004, -0.004):
             shift.value[:] = side, 0.01
             step = problem.solve()
@@ -340,30 +342,30 @@ def test_block_in_corner_of_floor_and_wall(
     for cells of a half to a third of the block, as the forces at the common edge are not unique.
     """
     displacements = []
-    for given in (AUGMENTED, {}):
+    for options in (AUGMENTED, {}):
         scene = block(cell, 1, n=n, E=modulus)
-        springs = {} if given else dict.fromkeys(("k_n", "k_t"), fc.RelativeStiffness(1e4))
+        springs = {} if options else dict.fromkeys(("k_n", "k_t"), fc.RelativeStiffness(1e4))
         laws = [fc.Coulomb(mu, **springs) for mu in frictions]
-        floor = scene.contact(laws[0], **given)
+        floor = scene.contact(laws[0], **options)
         obstacle = fc.HalfSpace((-gap, 0.0, 0.0), (1.0, 0.0, 0.0))
         surface = fc.ContactSurface(scene.mesh, scene.tags, LEFT)
-        wall = fc.Contact(scene.u, surface, obstacle, laws[1], name="wall", **given)
-        held = [scene.dirichlet_bc(FRONT, 1)]
-        problem = fc.ContactProblem(scene.F, scene.u, bcs=held, contacts=[floor, wall])
-        for share in (1 / 3, 2 / 3, 1.0, 0.8, 0.6, 0.4, 0.2):
-            side, up = (-share * part for part in load)
+        wall = fc.Contact(scene.u, surface, obstacle, laws[1], name="wall", **options)
+        bcs = [scene.dirichlet_bc(FRONT, 1)]
+        problem = fc.ContactProblem(scene.F, scene.u, bcs=bcs, contacts=[floor, wall])
+        for factor in (1 / 3, 2 / 3, 1.0, 0.8, 0.6, 0.4, 0.2):
+            side, up = (-factor * part for part in load)
             scene.load(side=side, up=up)
             problem.solve()
             problem.commit()
             force = sum(contact.resultants().force for contact in (floor, wall))
-            assert is_close(force[[0, 2]], [-side, -up], 1e-8 if given else 1e-7)
+            assert is_close(force[[0, 2]], [-side, -up], 1e-8 if options else 1e-7)
         displacements.append(nodal_values(scene.u))
     assert is_close(*displacements, 0.02)
 
 
 def test_augment_called_directly_gives_the_same_multipliers() -> None:
     """Direct calls of `augment` give the pressure of the problem's own augmentations, to 1e-4."""
-    made = []
+    pressures = []
     for by_hand in (False, True):
         scene = block("quadrilateral", 1, n=4, up=-10.0)
         problem, contact = scene.problem(
@@ -380,8 +382,8 @@ def test_augment_called_directly_gives_the_same_multipliers() -> None:
             assert errors[0] > 1e-3 and errors[-1] <= 1e-5
         else:
             problem.solve()
-        made.append(gather(COMM, contact.pressure))
-    assert is_close(made[1], made[0], 1e-4)
+        pressures.append(gather(COMM, contact.pressure))
+    assert is_close(pressures[1], pressures[0], 1e-4)
 
 
 @pytest.mark.skipif(COMM.size > 1, reason="of the condensed problem; ranks are compared below")
@@ -396,8 +398,10 @@ def test_sliding_over_nonmatching_facets() -> None:
     normal = []
     for k, options in ((10.0, AUGMENTED), (1e4, {}), (10.0, {})):
         law = fc.Coulomb(0.3, fc.RelativeStiffness(k), fc.RelativeStiffness(k))
-        made = two_blocks.SlidingBlock("triangle", law, start=0.4, contact=options, method="newton")
-        steps = [made.step(0.01, 0.0), *(made.step(0.01, 0.1 * i) for i in range(1, 6))]
+        setup = two_blocks.SlidingBlock(
+            "triangle", law, start=0.4, contact=options, method="newton"
+        )
+        steps = [setup.step(0.01, 0.0), *(setup.step(0.01, 0.1 * i) for i in range(1, 6))]
         last = steps[-1].contacts["contact"]
         assert last.tangential_force == pytest.approx(0.3 * last.normal_force, rel=1e-6)
         normal.append(last.normal_force)
@@ -426,15 +430,15 @@ def test_obstacle_moved_by_a_force() -> None:
 
 def test_multipliers_do_not_depend_on_the_number_of_ranks() -> None:
     """All ranks together find the tractions of one rank, to 1e-5, ten times `tolerance`."""
-    found = []
+    computed = []
     for comm in (COMM, MPI.COMM_SELF):
         scene = block("triangle", 2, n=6, up=-10.0, side=1.0, comm=comm)
         law = fc.Coulomb(0.3)
         contact = {"obstacle": parabolic_floor(scene), "tolerance": 1e-6} | AUGMENTED
         problem, contact = scene.problem(law, [scene.dirichlet_bc(TOP, 0, 0.001)], contact=contact)
         problem.solve()
-        found.append(point_values(contact, contact.traction))
-    assert is_close(found[0], found[1], 1e-5)
+        computed.append(point_values(contact, contact.traction))
+    assert is_close(computed[0], computed[1], 1e-5)
 
 
 def test_restart_from_checkpoint_with_multipliers(tmp_path: Path) -> None:
@@ -443,7 +447,7 @@ def test_restart_from_checkpoint_with_multipliers(tmp_path: Path) -> None:
     Tolerance 1e-9 of the tractions: both start from the same numbers.
     """
     folder = shared_folder(tmp_path)
-    made = []
+    tractions = []
     for take_up in (False, True):
         scene = block("triangle", 2, n=3, up=-10.0)
         law = fc.Coulomb(0.3, k_n=1e4, k_t=1e4)
@@ -458,8 +462,8 @@ def test_restart_from_checkpoint_with_multipliers(tmp_path: Path) -> None:
             checkpoint.save(problem, folder / "state.npz")
         scene.load(up=-10.0, side=2.0)
         problem.solve()
-        made.append(point_values(contact, contact.traction))
-    assert is_close(made[1], made[0], 1e-9)
+        tractions.append(point_values(contact, contact.traction))
+    assert is_close(tractions[1], tractions[0], 1e-9)
 
 
 @pytest.mark.parametrize("k", [10.0, 100.0])
@@ -522,13 +526,13 @@ def test_reloading_an_unconstrained_body_after_complete_unloading(cell):
     scene = block(cell, 2, n=4)
     contact = scene.contact(fc.Coulomb(0.5), kinematics="finite", **AUGMENTED)
     problem = fc.ContactProblem(scene.F, scene.u, contacts=[contact])
-    found = []
+    computed = []
     for up in (-10.0, 0.0, -10.0):
         scene.load(up=up)
         problem.solve()
         problem.commit()
         force = contact.resultants().force
         assert is_close(force, scene.vector(up=-up), 1e-9, scale=10.0)
-        found.append(values(contact, "normal_traction"))
-    assert not found[1].any()
-    assert is_close(found[2], found[0], 1e-4)
+        computed.append(values(contact, "normal_traction"))
+    assert not computed[1].any()
+    assert is_close(computed[2], computed[0], 1e-4)

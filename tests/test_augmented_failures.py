@@ -21,8 +21,8 @@ SOFT = fc.RelativeStiffness(10.0)
 AUGMENTED = {"enforcement": "augmented"}
 
 
-@pytest.mark.parametrize("what", ["iterations", "rounds"])
-def test_failure_leaves_no_trace(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("limit", ["iterations", "augmentations"])
+def test_failure_leaves_no_trace(limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Too few iterations or augmentations leave u, history and multipliers bitwise unchanged."""
     scene = block("quadrilateral", 1, n=4, up=-10.0)
     problem, contact = scene.problem(
@@ -38,7 +38,7 @@ def test_failure_leaves_no_trace(what: str, monkeypatch: pytest.MonkeyPatch) -> 
         return [f.x.array.copy() for f in functions]
 
     before = state()
-    if what == "rounds":
+    if limit == "augmentations":
         monkeypatch.setattr(module, "_MAX_AUGMENTATIONS", 2)
     else:
         problem.snes.setTolerances(max_it=0)
@@ -46,7 +46,9 @@ def test_failure_leaves_no_trace(what: str, monkeypatch: pytest.MonkeyPatch) -> 
         problem.solver.predictor.predict = False  # the predicted state can be the solution
     scene.load(up=-30.0, side=5.0)
     words = (
-        ("augmented Lagrangian method has not converged",) if what == "rounds" else ("increment 2",)
+        ("augmented Lagrangian method has not converged",)
+        if limit == "augmentations"
+        else ("increment 2",)
     )
     assert_raised_on_all_ranks(problem.solve, fc.NotConverged, *words)
     assert all(np.array_equal(a, b) for a, b in zip(before, state(), strict=True))
@@ -95,10 +97,10 @@ def test_contact_closed_only_before_the_first_augmentation() -> None:
         scene.u, top, obstacle, fc.Frictionless(100.0), name="ledge", enforcement="augmented"
     )
     errors = []
-    kept = ledge.enforcement_error
+    error_before = ledge.enforcement_error
 
     def noted() -> float:
-        errors.append(kept())
+        errors.append(error_before())
         return errors[-1]
 
     ledge.enforcement_error = noted
@@ -119,7 +121,7 @@ def test_dirichlet_node_inside_the_obstacle_is_refused(kinematics, method):
     relative to them, and pressures of 1e15 were accepted. If the node moves away from the wall, or
     with the penalty, the problem is solved.
     """
-    found = []
+    computed = []
     for enforcement, displacement in (("augmented", 0.02), ("augmented", -0.02), ("penalty", 0.02)):
         scene = rubber("quadrilateral", 1, n=(4, 4), linear=True)
         surface = fc.ContactSurface(scene.mesh, scene.tags, RIGHT)
@@ -144,5 +146,5 @@ def test_dirichlet_node_inside_the_obstacle_is_refused(kinematics, method):
                 problem.solve()
         else:
             problem.solve()
-            found.append(contact.resultants().normal_force)
-    assert found[0] == 0.0 and 0.0 < found[1] < 1e3
+            computed.append(contact.resultants().normal_force)
+    assert computed[0] == 0.0 and 0.0 < computed[1] < 1e3

@@ -15,10 +15,10 @@ pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 
 @pytest.mark.parametrize(
-    ("friction", "share"), [(0.0, 1e-1), (0.0, 1e-6), (0.5, 1e-3), (0.5, 1e-6)]
+    ("friction", "factor"), [(0.0, 1e-1), (0.0, 1e-6), (0.5, 1e-3), (0.5, 1e-6)]
 )
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
-def test_unloading_takes_at_most_twice_the_iterations_of_loading(cell, friction, share):
+def test_unloading_takes_at_most_twice_the_iterations_of_loading(cell, friction, factor):
     """Unloading in one increment takes at most twice the iterations of loading from zero.
 
     Starting from the multipliers of the previous load it takes up to a hundred times as many, or
@@ -27,7 +27,7 @@ def test_unloading_takes_at_most_twice_the_iterations_of_loading(cell, friction,
     """
     law = fc.Coulomb(friction) if friction else fc.Frictionless()
 
-    def found(*loads):
+    def solve_loads(*loads):
         scene = block(cell, 1, n=4)
         contact = scene.contact(law, enforcement="augmented")
         problem = fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=[contact])
@@ -39,10 +39,10 @@ def test_unloading_takes_at_most_twice_the_iterations_of_loading(cell, friction,
         assert contact.resultants().force[-1] == pytest.approx(loads[-1], rel=1e-8)
         return iterations, nodal_values(scene.u)
 
-    (rise, fall), u = found(10.0, 10.0 * share)
+    (rise, fall), u = solve_loads(10.0, 10.0 * factor)
     assert fall <= 2 * rise
     if not friction:
-        assert is_close(u, found(10.0 * share)[1], 1e-4)
+        assert is_close(u, solve_loads(10.0 * factor)[1], 1e-4)
 
 
 def test_unloading_of_one_body_with_constant_load_on_another():
@@ -73,6 +73,6 @@ def test_unloading_of_one_body_with_constant_load_on_another():
         loads[1].value = load
         iterations.append(problem.solve().iterations)
         problem.commit()
-        for contact, wanted in zip(contacts, (1000.0, load), strict=True):
-            assert contact.resultants().force[1] == pytest.approx(wanted, rel=1e-8)
+        for contact, expected in zip(contacts, (1000.0, load), strict=True):
+            assert contact.resultants().force[1] == pytest.approx(expected, rel=1e-8)
     assert iterations[1] <= 2 * iterations[0]

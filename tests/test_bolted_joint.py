@@ -18,28 +18,28 @@ def test_tightened_joint_is_pulled_to_the_friction_limit() -> None:
     nut of the bolt cancel, to 1e-3 of the clamping force (the preset solves to 1e-4 of each body's
     forces). Linear elements, on which the clamping force itself depends, are sufficient for this.
     """
-    made = BoltedJoint(5.0, degree=1)
-    for _ in made.increments(3.5, steps=7):
-        r = {c.name: c.resultants() for c in made.contacts}
+    setup = BoltedJoint(5.0, degree=1)
+    for _ in setup.increments(3.5, steps=7):
+        r = {c.name: c.resultants() for c in setup.contacts}
         clamped = r["head"].normal_force
         assert r["nut"].normal_force == pytest.approx(clamped, rel=1e-3)
         assert abs(r["nut"].force[0] + r["head"].force[0]) < 1e-3 * clamped
-        borne = r["plates"].force[0] + r["head"].force[0]
-        assert abs(borne - float(made.pull.value)) < 1e-3 * clamped
-        for found in r.values():
-            assert found.tangential_force <= FRICTION * found.normal_force * (1 + 1e-9)
+        plate_force = r["plates"].force[0] + r["head"].force[0]
+        assert abs(plate_force - float(setup.pull.value)) < 1e-3 * clamped
+        for resultants in r.values():
+            assert resultants.tangential_force <= FRICTION * resultants.normal_force * (1 + 1e-9)
     # All points of the plates slip now; the bolt carries the rest.
     assert r["plates"].stick == 0
     assert r["plates"].force[0] == pytest.approx(FRICTION * r["plates"].normal_force, rel=1e-3)
     limit = FRICTION * (r["plates"].normal_force + clamped)
-    assert limit > float(made.pull.value) > 0.7 * limit
-    made.load(1.0 + 1.02 * limit / 1000.0)
+    assert limit > float(setup.pull.value) > 0.7 * limit
+    setup.load(1.0 + 1.02 * limit / 1000.0)
     words = "overload: along the translation along x of body 2"
     failed: list[fc.NotConverged] = []
 
     def solve() -> None:
         try:
-            made.problem.solve()
+            setup.problem.solve()
         except fc.NotConverged as error:
             failed.append(error)
             raise
@@ -49,8 +49,8 @@ def test_tightened_joint_is_pulled_to_the_friction_limit() -> None:
     # second it is the only one, with 11. How many times L-BFGS makes 20 iterations before depends
     # on round-off.
     tried = failed[0].attempts
-    every = ["lbfgs", "primal_dual", "continuation", "alternating", "alternating"]
-    assert [each.method for each in tried] == every
+    methods = ["lbfgs", "primal_dual", "continuation", "alternating", "alternating"]
+    assert [each.method for each in tried] == methods
     assert all(each.iterations < 20 for each in tried[3:])
 
 
@@ -61,13 +61,13 @@ def test_joint_is_tightened_if_all_points_of_head_and_nut_slip() -> None:
     constrains the bolt. It was refused, as unconstrained. References: statics, as above; the
     small-displacement error, at most 1 %.
     """
-    made = BoltedJoint(5.0, degree=2)
+    setup = BoltedJoint(5.0, degree=2)
     for load in (0.5, 1.0):
-        made.load(load)
-        step = made.problem.solve()
-        made.problem.commit()
+        setup.load(load)
+        step = setup.problem.solve()
+        setup.problem.commit()
         assert all(step.contacts[name].stick == 0 for name in ("head", "nut"))
         assert step.attempts[0].method == "lbfgs"  # default, although the bolt is free
         assert max(each.worst for each in step.verdict.small_displacement_error.values()) < 0.01
-        forces = [contact.resultants().normal_force for contact in made.contacts]
+        forces = [contact.resultants().normal_force for contact in setup.contacts]
         assert forces == pytest.approx([forces[1]] * 3, rel=1e-3)

@@ -22,7 +22,7 @@ PRESS = 10.0
 pytestmark = pytest.mark.two_ranks
 
 
-def wedge(**options):
+def wedge_between_walls(**options):
     """Make a wedge between a vertical and an inclined wall, constrained by friction alone."""
     scene = block("quadrilateral", n=6)
     x = scene.mesh.geometry.x
@@ -46,12 +46,12 @@ def wedge(**options):
     return scene, problem, contacts
 
 
-def released(steps, **options):
+def release_wedge(steps, **options):
     """Press the wedge in and release it in ``steps`` increments; return normal forces and steps."""
-    scene, problem, contacts = wedge(**options)
+    scene, problem, contacts = wedge_between_walls(**options)
 
-    def load(share):
-        scene.load(up=-PRESS * share)
+    def load(factor):
+        scene.load(up=-PRESS * factor)
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
@@ -63,10 +63,10 @@ def released(steps, **options):
 @pytest.mark.parametrize("method", [None, "newton", "continuation"])
 def test_locked_wedge_keeps_its_forces(method):
     """Released in one increment, cut when it is ejected, it has the forces of eight, within 2 %."""
-    expected, steps = released(8)
+    expected, steps = release_wedge(8)
     assert len(steps) == 8 and np.all(expected > 5.0)
-    found, _ = released(1, method=method)
-    assert is_close(found, expected, 0.02)
+    computed, _ = release_wedge(1, method=method)
+    assert is_close(computed, expected, 0.02)
 
 
 @pytest.mark.each
@@ -81,10 +81,10 @@ def test_locked_wedge_without_load_is_not_taken_for_unloaded(pull, method):
     """
     forces = []
     for steps in (1, 8):
-        scene, problem, contacts = wedge(method=method)
+        scene, problem, contacts = wedge_between_walls(method=method)
 
-        def load(share, scene=scene):
-            scene.load(up=-PRESS * share)
+        def load(factor, scene=scene):
+            scene.load(up=-PRESS * factor)
 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
@@ -99,7 +99,7 @@ def test_locked_wedge_without_load_is_not_taken_for_unloaded(pull, method):
 
 def test_ejected_wedge_is_refused():
     """Without cuts the increment is refused with the reason, and the history is unchanged."""
-    scene, problem, contacts = wedge(method="newton")
+    scene, problem, contacts = wedge_between_walls(method="newton")
     scene.load(up=-PRESS)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
@@ -118,11 +118,11 @@ def test_friction_supplies_at_most_one_percent_of_the_energy():
 
     If slip is reversed within an increment the mean of the tractions misses this: 1 %.
     """
-    scene, problem, _ = wedge()
+    scene, problem, _ = wedge_between_walls()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        for share in (0.5, 1.0, 0.75, 0.5, 0.25, 0.0, 0.5, 1.0):
-            scene.load(up=-PRESS * share)
+        for factor in (0.5, 1.0, 0.75, 0.5, 0.25, 0.0, 0.5, 1.0):
+            scene.load(up=-PRESS * factor)
             step = problem.solve()
             problem.commit()
             assert step.energy.friction_energy_gain == step.verdict.friction_energy_gain <= 0.01

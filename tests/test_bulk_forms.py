@@ -140,8 +140,8 @@ def test_plane_stress_with_thickness():
     scene.problem(law, scene.rollers(), contact={"weight": t})
     _, scaled = scene.problem(law, scene.rollers(), contact={"weight": t})
     k = gather(COMM, scaled.values.parameters["k_n"])
-    given = scene.contact(law, modulus=E)
-    reference = gather(COMM, given.values.parameters["k_n"])
+    with_modulus = scene.contact(law, modulus=E)
+    reference = gather(COMM, with_modulus.values.parameters["k_n"])
     assert np.all(np.abs(k / reference - 1) <= 0.1)
     assert np.array_equal(gather(COMM, contact.status), np.full(len(k), fc.Status.SLIP))
 
@@ -259,18 +259,18 @@ def test_nonlinear_bulk(cell, method):
         petsc_options={"snes_rtol": 1e-11},
     )
     assert not problem.full.bulk.linear
-    for share in (0.5, 1.0):
-        scene.load(up=-share * p)
+    for load_factor in (0.5, 1.0):
+        scene.load(up=-load_factor * p)
         step = problem.solve()
         problem.commit()
-        roots = np.roots([E / 2, 0, -E / 2, share * p])
+        roots = np.roots([E / 2, 0, -E / 2, load_factor * p])
         stretch = max(r.real for r in roots if abs(r.imag) < 1e-12)
         assert 0.5 < stretch < 1.0
-        assert step.contacts["contact"].normal_force == pytest.approx(share * p, rel=1e-8)
+        assert step.contacts["contact"].normal_force == pytest.approx(load_factor * p, rel=1e-8)
 
-        def exact(x, stretch=stretch, share=share):
+        def exact(x, stretch=stretch, load_factor=load_factor):
             rows = [0 * x[0] for _ in range(scene.dim)]
-            rows[-1] = (stretch - 1) * x[scene.dim - 1] - share * p / k_n
+            rows[-1] = (stretch - 1) * x[scene.dim - 1] - load_factor * p / k_n
             return np.vstack(rows)
 
         assert is_interpolant(scene.u, exact, 1e-8)
@@ -321,7 +321,7 @@ def test_collapsed_cells_do_not_loosen_later_tolerances():
     Newton's method to 1e-12, without the failure; to 1e-8 of the largest displacement, for 1e-9 of
     the forces.
     """
-    found = []
+    computed = []
     for displacements, options in (
         ((0.1, 1.5, 0.12), {"method": "lbfgs", "linear_solver": "multigrid"}),
         ((0.1, 0.12), {"method": "newton", "petsc_options": {"snes_rtol": 1e-12}}),
@@ -336,8 +336,8 @@ def test_collapsed_cells_do_not_loosen_later_tolerances():
                 continue
             problem.solve()
             problem.commit()
-        found.append(nodal_values(body.u))
-    assert is_close(*found, 1e-8)
+        computed.append(nodal_values(body.u))
+    assert is_close(*computed, 1e-8)
 
 
 def test_inverted_corner_is_detected_by_any_quadrature():

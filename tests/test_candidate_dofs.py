@@ -1,7 +1,8 @@
 """Candidate dofs: static condensation retains only the dofs that can come into contact.
 
-Γc is tagged generously. References are the same scene on all dofs, or with a tight tag. All are
-solved to 1e-12 of the forces and agree to 1e-8 of the largest entry, in successive increments.
+Γc is tagged beyond the contact. References are the same scene on all dofs, or with a tight tag.
+All are solved to 1e-12 of the forces and agree to 1e-8 of the largest entry, in successive
+increments.
 """
 
 import logging
@@ -25,19 +26,19 @@ TIGHT = {"petsc_options": {"snes_rtol": 1e-12}}
 FEW = 500
 
 
-def n_retained_dofs(made):
+def n_retained_dofs(setup):
     """Return the number of retained dofs."""
-    system = made.problem.solver.system
-    assert made.problem.solver.condensed
+    system = setup.problem.solver.system
+    assert setup.problem.solver.condensed
     return system.unknowns.n_global
 
 
-def run(made, end=1.0, steps=2, **options):
+def run(setup, end=1.0, steps=2, **options):
     """Run the increments to ``end``; return them and their results."""
-    found = list(made.increments(end, steps=steps, **options))
-    forces = np.array([step.contacts["contact"].force for step in found])
-    counts = [[s.contacts["contact"].stick, s.contacts["contact"].slip] for s in found]
-    return found, {"u": nodal_values(made.u), "forces": forces, "counts": np.array(counts)}
+    steps_taken = list(setup.increments(end, steps=steps, **options))
+    forces = np.array([step.contacts["contact"].force for step in steps_taken])
+    counts = [[s.contacts["contact"].stick, s.contacts["contact"].slip] for s in steps_taken]
+    return steps_taken, {"u": nodal_values(setup.u), "forces": forces, "counts": np.array(counts)}
 
 
 def assert_same(one, other, rtol=SAME):
@@ -54,17 +55,17 @@ def n_grown(steps):
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_generously_tagged_surface(cell):
+def test_surface_tagged_beyond_the_contact(cell):
     """Results are those of all dofs and of a tight tag; few dofs are retained, condensed once."""
-    made = IndentedBlock(cell=cell, **TIGHT)
-    steps, found = run(made)
-    assert n_retained_dofs(made) <= FEW
+    setup = IndentedBlock(cell=cell, **TIGHT)
+    steps, computed = run(setup)
+    assert n_retained_dofs(setup) <= FEW
     assert sum(step.factorisations for step in steps) == 1
     assert n_grown(steps) == 0
     full = IndentedBlock(cell=cell, condensation=False, **TIGHT)
-    assert_same(found, run(full)[1])
+    assert_same(computed, run(full)[1])
     # The closed points cover a sixth of the tag at most.
-    assert_same(found, run(IndentedBlock(cell=cell, contact_half_width=0.5, **TIGHT))[1])
+    assert_same(computed, run(IndentedBlock(cell=cell, contact_half_width=0.5, **TIGHT))[1])
 
 
 LAWS = {
@@ -78,21 +79,21 @@ LAWS = {
 def test_laws(law):
     """Results agree for laws of every kind, with the ball dragged a little."""
     cell = "tetrahedron" if law == "polygon" else "quadrilateral"
-    made = [IndentedBlock(LAWS[law], cell=cell, condensation=c, **TIGHT) for c in (None, False)]
-    (steps, found), (_, full) = (run(m, 1.2, 3) for m in made)
-    assert n_retained_dofs(made[0]) <= FEW
+    setups = [IndentedBlock(LAWS[law], cell=cell, condensation=c, **TIGHT) for c in (None, False)]
+    (steps, computed), (_, full) = (run(m, 1.2, 3) for m in setups)
+    assert n_retained_dofs(setups[0]) <= FEW
     assert n_grown(steps) == 0
-    assert_same(found, full)
+    assert_same(computed, full)
 
 
 @pytest.mark.each
 @pytest.mark.parametrize("method", ["lbfgs", "newton", "alternating", "continuation"])
 def test_methods(method):
     """Results agree for all methods; L-BFGS has fewer digits, with and without condensation."""
-    made = [IndentedBlock(condensation=c, method=method, **TIGHT) for c in (None, False)]
-    (_, found), (_, full) = (run(m) for m in made)
-    assert n_retained_dofs(made[0]) <= FEW
-    assert_same(found, full)
+    setups = [IndentedBlock(condensation=c, method=method, **TIGHT) for c in (None, False)]
+    (_, computed), (_, full) = (run(m) for m in setups)
+    assert n_retained_dofs(setups[0]) <= FEW
+    assert_same(computed, full)
 
 
 def test_multipliers():
@@ -100,20 +101,20 @@ def test_multipliers():
     tolerance = 1e-6
     options = {"cell": "tetrahedron", "contact": {"enforcement": "augmented"}} | TIGHT
     options["contact"]["tolerance"] = tolerance
-    made = [IndentedBlock(condensation=c, **options) for c in (None, False)]
-    (steps, found), (_, full) = (run(m, 1.5, 3) for m in made)
-    assert n_retained_dofs(made[0]) <= FEW
+    setups = [IndentedBlock(condensation=c, **options) for c in (None, False)]
+    (steps, computed), (_, full) = (run(m, 1.5, 3) for m in setups)
+    assert n_retained_dofs(setups[0]) <= FEW
     assert max(step.augmentations for step in steps) > 1
-    assert_same(found, full, tolerance)
+    assert_same(computed, full, tolerance)
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_ball_pushed_by_a_force(cell):
     """The motion of the ball is unknown: it could close points away from the contact unseen."""
-    made = [IndentedBlock(cell=cell, force=20.0, condensation=c, **TIGHT) for c in (None, False)]
-    (_, found), (_, full) = (run(m, 1.2, 3) for m in made)
-    assert n_retained_dofs(made[0]) <= FEW + 1
-    assert_same(found, full)
+    setups = [IndentedBlock(cell=cell, force=20.0, condensation=c, **TIGHT) for c in (None, False)]
+    (_, computed), (_, full) = (run(m, 1.2, 3) for m in setups)
+    assert n_retained_dofs(setups[0]) <= FEW + 1
+    assert_same(computed, full)
 
 
 @pytest.mark.parametrize("pressure", [5.0, 40.0])
@@ -122,10 +123,10 @@ def test_body_constrained_by_contact_alone(pressure):
 
     With the larger pressure contact spreads beyond the retained dofs.
     """
-    made = [IndentedBlock(pressure=pressure, condensation=c, **TIGHT) for c in (True, False)]
-    (steps, found), (_, full) = (run(m, 1.0, 4) for m in made)
-    assert n_grown(steps) >= 1 if pressure > 10 else n_retained_dofs(made[0]) <= FEW
-    assert_same(found, full)
+    setups = [IndentedBlock(pressure=pressure, condensation=c, **TIGHT) for c in (True, False)]
+    (steps, computed), (_, full) = (run(m, 1.0, 4) for m in setups)
+    assert n_grown(steps) >= 1 if pressure > 10 else n_retained_dofs(setups[0]) <= FEW
+    assert_same(computed, full)
 
 
 @pytest.mark.parametrize("update", ["never", pytest.param("increment", marks=ON_ONE_RANK)])
@@ -135,10 +136,10 @@ def test_two_bodies(update):
     The pairs are those of the undeformed bodies, or updated.
     """
     end, steps = (1.0, 2) if update == "never" else (1.5, 6)
-    made = [BlockUnderShoe(update_pairs=update, condensation=c, **TIGHT) for c in (None, False)]
-    (_, found), (_, full) = (run(m, end, steps) for m in made)
-    assert n_retained_dofs(made[0]) <= FEW
-    assert_same(found, full)
+    setups = [BlockUnderShoe(update_pairs=update, condensation=c, **TIGHT) for c in (None, False)]
+    (_, computed), (_, full) = (run(m, end, steps) for m in setups)
+    assert n_retained_dofs(setups[0]) <= FEW
+    assert_same(computed, full)
 
 
 # ---- spreading contact ---------------------------------------------------------------------------
@@ -151,25 +152,25 @@ def test_contact_moves_beyond_the_retained_dofs(cell, condensation):
 
     More are retained if condensation is requested.
     """
-    made = [IndentedBlock(cell=cell, condensation=c, **TIGHT) for c in (condensation, False)]
-    (steps, found), (_, full) = (run(m, 3.5, 7) for m in made)
+    setups = [IndentedBlock(cell=cell, condensation=c, **TIGHT) for c in (condensation, False)]
+    (steps, computed), (_, full) = (run(m, 3.5, 7) for m in setups)
     assert 1 <= n_grown(steps) <= 2
     assert sum(step.factorisations for step in steps) == 1 + n_grown(steps)
     if condensation is None:
-        assert n_retained_dofs(made[0]) <= FEW
-    assert_same(found, full)
+        assert n_retained_dofs(setups[0]) <= FEW
+    assert_same(computed, full)
 
 
 @ON_ONE_RANK
 def test_two_bodies_pressed_deep():
     """Results agree as the contact of the shoe grows wider than the dofs retained at first."""
-    made = [
+    setups = [
         BlockUnderShoe(depth=0.05, condensation=c, small_displacement_tolerance=np.inf, **TIGHT)
         for c in (True, False)
     ]
-    (steps, found), (_, full) = (run(m, 1.0, 5) for m in made)
+    (steps, computed), (_, full) = (run(m, 1.0, 5) for m in setups)
     assert n_grown(steps) >= 1
-    assert_same(found, full)
+    assert_same(computed, full)
 
 
 @pytest.mark.parametrize("condensation", [None, True])
@@ -178,35 +179,35 @@ def test_pressed_deep(condensation):
 
     From then on all dofs are used, or all coupled dofs are retained if condensation is requested.
     """
-    made = [
+    setups = [
         IndentedBlock(depth=0.12, condensation=c, small_displacement_tolerance=np.inf, **TIGHT)
         for c in (condensation, False)
     ]
-    (steps, found), (_, full) = (run(m, 1.0, 10) for m in made)
+    (steps, computed), (_, full) = (run(m, 1.0, 10) for m in setups)
     assert steps[0].attempts[-1].outcome == "converged"
     assert n_grown(steps) >= 1
     if condensation:
-        assert n_retained_dofs(made[0]) > 1.5 * FEW
+        assert n_retained_dofs(setups[0]) > 1.5 * FEW
     else:
-        assert not made[0].problem.solver.condensed
-    assert_same(found, full)
+        assert not setups[0].problem.solver.condensed
+    assert_same(computed, full)
 
 
 def test_recovering_only_the_last_interior_displacement():
     """Results do not change, serially bit for bit: no point closes undetected."""
-    made = [IndentedBlock(condensation=True) for _ in range(2)]
-    (steps, found), (others, every) = (
+    setups = [IndentedBlock(condensation=True) for _ in range(2)]
+    (steps, computed), (others, complete) = (
         run(m, 3.0, 6, recover_interior=field)
-        for m, field in zip(made, ("last", "every"), strict=True)
+        for m, field in zip(setups, ("last", "every"), strict=True)
     )
     assert n_grown(steps) == n_grown(others) >= 1
     assert all(step.complete for step in steps)
-    assert_same(found, every, 0.0 if COMM.size == 1 else SAME)
+    assert_same(computed, complete, 0.0 if COMM.size == 1 else SAME)
     for one, other in zip(steps, others, strict=True):
         size = abs(other.energy.work) + abs(other.energy.elastic)
         for name in ("work", "elastic", "springs", "dissipation"):
-            ours, theirs = getattr(one.energy, name), getattr(other.energy, name)
-            assert is_close(ours, theirs, SAME, scale=size), name
+            energy, expected = getattr(one.energy, name), getattr(other.energy, name)
+            assert is_close(energy, expected, SAME, scale=size), name
 
 
 @pytest.mark.parametrize("condensation", [None, True])
@@ -224,19 +225,19 @@ def test_restart_on_all_dofs(tmp_path):
 
 def test_failed_increment_has_no_effect():
     """A failed increment changes neither u nor history nor the next increment (1e-9)."""
-    made, twin = (IndentedBlock(condensation=True, fallback=False) for _ in range(2))
-    for m in (made, twin):
+    setup, reference = (IndentedBlock(condensation=True, fallback=False) for _ in range(2))
+    for m in (setup, reference):
         run(m, 1.0)
-    before = made.u.x.array.copy()
-    limits = made.problem.solver.main.max_it
-    made.load(3.0)
-    made.problem.solver.main.max_it = 1
+    before = setup.u.x.array.copy()
+    limits = setup.problem.solver.main.max_it
+    setup.load(3.0)
+    setup.problem.solver.main.max_it = 1
     with pytest.raises(fc.NotConverged):
-        made.problem.solve()
-    made.problem.solver.main.max_it = limits
-    assert np.array_equal(made.u.x.array, before)
+        setup.problem.solve()
+    setup.problem.solver.main.max_it = limits
+    assert np.array_equal(setup.u.x.array, before)
     results = []
-    for m in (made, twin):
+    for m in (setup, reference):
         m.load(1.5)
         m.problem.solve()
         m.problem.commit()
@@ -246,9 +247,9 @@ def test_failed_increment_has_no_effect():
 
 def test_units():
     """Retained dofs, effort and digits are the same in other units, to 1e-9 of the field."""
-    made = [IndentedBlock(length=length) for length in (1.0, 1e-3)]
-    (one, a), (other, b) = (run(m, 2.0, 4) for m in made)
-    assert n_retained_dofs(made[0]) == n_retained_dofs(made[1])
+    setups = [IndentedBlock(length=length) for length in (1.0, 1e-3)]
+    (one, a), (other, b) = (run(m, 2.0, 4) for m in setups)
+    assert n_retained_dofs(setups[0]) == n_retained_dofs(setups[1])
     assert have_similar_iterations([s.iterations for s in one], [s.iterations for s in other])
     assert is_close(b["u"] / 1e-3, a["u"], 1e-9)
 
@@ -266,11 +267,11 @@ def test_candidates_on_the_whole_surface(caplog):
     for law, contact in everywhere.values():
         caplog.clear()
         with caplog.at_level(logging.INFO, logger="fenics_contact"):
-            made = IndentedBlock(law, contact=contact)
-        assert not made.problem.solver.condensed
+            setup = IndentedBlock(law, contact=contact)
+        assert not setup.problem.solver.condensed
         if COMM.rank == 0:
-            said = [record.getMessage() for record in caplog.records]
-            assert any("contact couples 1042 of" in text for text in said)
+            messages = [record.getMessage() for record in caplog.records]
+            assert any("contact couples 1042 of" in text for text in messages)
         forced = IndentedBlock(law, contact=contact, condensation=True)
         assert n_retained_dofs(forced) == 2 * (CELLS["quadrilateral"][0] + 1)
 
@@ -278,10 +279,10 @@ def test_candidates_on_the_whole_surface(caplog):
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_any_number_of_ranks(cell):
     """Retained dofs, their growth, effort and forces are those on one rank."""
-    made, alone = (IndentedBlock(cell=cell, comm=comm, **TIGHT) for comm in (COMM, MPI.COMM_SELF))
-    (steps, found), (serial, expected) = (run(m, 3.0, 6) for m in (made, alone))
-    assert n_retained_dofs(made) == n_retained_dofs(alone)
+    setup, alone = (IndentedBlock(cell=cell, comm=comm, **TIGHT) for comm in (COMM, MPI.COMM_SELF))
+    (steps, computed), (serial, expected) = (run(m, 3.0, 6) for m in (setup, alone))
+    assert n_retained_dofs(setup) == n_retained_dofs(alone)
     assert have_similar_iterations([s.iterations for s in steps], [s.iterations for s in serial])
     assert n_grown(steps) == n_grown(serial)
     for name in ("forces", "counts"):
-        assert is_close(found[name], expected[name], SAME), name
+        assert is_close(computed[name], expected[name], SAME), name

@@ -42,9 +42,9 @@ def test_restart_finds_the_same_pairs_of_penetrating_bodies(release, tmp_path):
     penetrate deeply.
     """
 
-    def load(made):
+    def load(setup):
         def move(t):
-            made.top_displacement[-1].value, made.top_displacement[0].value = (
+            setup.top_displacement[-1].value, setup.top_displacement[0].value = (
                 -5e-3 * min(t, 1.0),
                 0.1 * max(t - 1.0, 0.0),
             )
@@ -55,48 +55,52 @@ def test_restart_finds_the_same_pairs_of_penetrating_bodies(release, tmp_path):
         law = fc.Coulomb(0.2, K_N / 50, K_N / 50)
         return SlidingBlock("quadrilateral", law, start=0.4, max_initial_penetration=release)
 
-    whole = make()
-    list(fc.increments(whole.problem, load(whole), 0.0, 3.0, steps=3))
+    uninterrupted = make()
+    list(fc.increments(uninterrupted.problem, load(uninterrupted), 0.0, 3.0, steps=3))
     path = tmp_path / "state"
     path = COMM.bcast(path)
     first = make()
     steps = fc.increments(first.problem, load(first), 0.0, 3.0, steps=3, checkpoint=path)
     next(steps), next(steps)
     steps.close()
-    again = make()
-    rest = list(fc.increments(again.problem, load(again), 0.0, 3.0, steps=3, checkpoint=path))
-    assert len(rest) == 1
-    assert again.contact.n_unpaired == whole.contact.n_unpaired
-    assert is_close(nodal_values(again.u), nodal_values(whole.u), 1e-9)
-    assert is_close(rest[0].contacts["contact"].force, whole.contact.resultants().force, 1e-9)
+    resumed = make()
+    remaining = list(
+        fc.increments(resumed.problem, load(resumed), 0.0, 3.0, steps=3, checkpoint=path)
+    )
+    assert len(remaining) == 1
+    assert resumed.contact.n_unpaired == uninterrupted.contact.n_unpaired
+    assert is_close(nodal_values(resumed.u), nodal_values(uninterrupted.u), 1e-9)
+    assert is_close(
+        remaining[0].contacts["contact"].force, uninterrupted.contact.resultants().force, 1e-9
+    )
 
 
 def test_commit_that_fails_in_the_pair_search_changes_no_state(monkeypatch):
     """After a pair search that fails, a solve gives the results of a restored twin, to 1e-9."""
     law = fc.Coulomb(0.2, K_N, K_N)
-    made, twin = (SlidingBlock("quadrilateral", law, start=0.4) for _ in range(2))
-    for each in (made, twin):
+    setup, reference = (SlidingBlock("quadrilateral", law, start=0.4) for _ in range(2))
+    for each in (setup, reference):
         each.step(2e-3, 0.0)
         each.top_displacement[0].value = 0.15
         each.problem.solve()
     with monkeypatch.context() as patch:
 
-        def broken(*args, **kwargs):
-            kept(*args, **kwargs)
+        def failing_search(*args, **kwargs):
+            find_pairs(*args, **kwargs)
             raise MemoryError("on purpose")
 
-        kept = made.contact.contact_kinematics.find_pairs
-        patch.setattr(made.contact.contact_kinematics, "find_pairs", broken)
+        find_pairs = setup.contact.contact_kinematics.find_pairs
+        patch.setattr(setup.contact.contact_kinematics, "find_pairs", failing_search)
         with pytest.raises(MemoryError):
-            made.problem.commit()
-    for each in (made, twin):
-        if each is twin:
+            setup.problem.commit()
+    for each in (setup, reference):
+        if each is reference:
             each.problem.restore()
         each.problem.solve()
         each.problem.commit()
         each.step(2e-3, 0.3)
-    assert is_close(nodal_values(made.u), nodal_values(twin.u), 1e-9)
-    assert is_close(made.contact.resultants().force, twin.contact.resultants().force, 1e-9)
+    assert is_close(nodal_values(setup.u), nodal_values(reference.u), 1e-9)
+    assert is_close(setup.contact.resultants().force, reference.contact.resultants().force, 1e-9)
 
 
 def test_foundation_without_tangential_stiffness_on_a_ball():
@@ -135,6 +139,6 @@ def test_fallback_without_contact_fails_without_an_error():
 
 def test_contact_between_bodies_has_no_potential():
     """Contact between two bodies cannot be written as a potential in u on Γc: refused."""
-    made = SlidingBlock("quadrilateral", fc.Frictionless(K_N), start=0.4)
+    setup = SlidingBlock("quadrilateral", fc.Frictionless(K_N), start=0.4)
     with pytest.raises(ValueError, match="opposing body"):
-        made.contact.potential()
+        setup.contact.potential()

@@ -42,12 +42,12 @@ def do_nothing(problem, contact):
 
 def change_parameters(problem, contact):
     """Change parameters of law and obstacle, which must not affect this commit."""
-    kept = {name: c.value.copy() for name, c in contact.parameters.items()}
+    saved = {name: c.value.copy() for name, c in contact.parameters.items()}
     contact.parameters["friction"].value = 0.01
     contact.parameters["displacement"].value[:] = 0.5, 0.1
     contact.evaluate()
     problem.commit()
-    for name, value in kept.items():
+    for name, value in saved.items():
         contact.parameters[name].value = value
 
 
@@ -63,11 +63,11 @@ def commit_twice(problem, contact):
 
 def fail_increment(problem, contact):
     """Solve an increment without a solution before the commit."""
-    kept = contact.parameters["displacement"].value.copy()
+    saved = contact.parameters["displacement"].value.copy()
     contact.parameters["displacement"].value[:] = np.nan
     with pytest.raises((fc.NotConverged, ValueError)):
         problem.solve()
-    contact.parameters["displacement"].value[:] = kept
+    contact.parameters["displacement"].value[:] = saved
 
 
 @pytest.mark.each
@@ -78,8 +78,8 @@ def fail_increment(problem, contact):
 )
 def test_commit_stores_the_solution_of_solve(between, enforcement, recover_interior):
     options = {"enforcement": enforcement, "recover_interior": recover_interior}
-    expected, found = drag_block(do_nothing, **options), drag_block(between, **options)
-    for a, b in zip(found, expected, strict=True):
+    expected, computed = drag_block(do_nothing, **options), drag_block(between, **options)
+    for a, b in zip(computed, expected, strict=True):
         assert is_close(a, b, EXACT)
     assert abs(expected[0][-1, 0]) > 0.1  # friction acts
 
@@ -124,16 +124,16 @@ def press_and_drag(new_problem):
     contact = scene.contact(fc.Coulomb(0.3), displacement=np.zeros(2))
     bcs = scene.rollers()
 
-    def made():
+    def make():
         return fc.ContactProblem(scene.F, scene.u, bcs=bcs, contacts=[contact])
 
-    problem = made()
+    problem = make()
     for up in (-5.0, -10.0):
         scene.load(up=up)
         problem.solve()
         problem.commit()
     if new_problem:
-        problem = made()
+        problem = make()
     scene.load(up=-8.0)
     contact.parameters["displacement"].value[:] = 1e-3, 0.0
     step = problem.solve()

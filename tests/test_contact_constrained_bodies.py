@@ -31,7 +31,7 @@ COMM = MPI.COMM_WORLD
 BULKS = {"linear": LinearElastic, "rubber": NeoHookean}
 
 
-class Free:
+class UnconstrainedBlock:
     """A block of size 1, with a traction on its top, on a floor that moves tangentially."""
 
     def __init__(self, cell, bulk, n=3, friction=0.3, size=1.0, modulus=1e3, gap=0.0, **options):
@@ -57,7 +57,7 @@ class Free:
         )
         self.problem = fc.ContactProblem(F, self.u, contacts=[self.contact])
 
-    def go(self, side, press, along=0.0):
+    def solve_increment(self, side, press, along=0.0):
         """Solve an increment; return iterations and Γc's mean displacement along x by the size."""
         self.traction.value[[0, -1]] = side * self.unit, -press * self.unit
         self.shift.value[0] = along * self.size
@@ -87,15 +87,15 @@ def test_released_block_keeps_its_position(gap, side, along, bulk, kinematics):
     linear block returned to its initial position and was pressed again from there, in 40 to 670
     iterations.
     """
-    scene = Free("quadrilateral", bulk, gap=gap, kinematics=kinematics)
-    first, _ = scene.go(side, 1.0)
-    scene.go(side, 1.0, along)
-    released, place = scene.go(0.0, 0.0, along)
+    scene = UnconstrainedBlock("quadrilateral", bulk, gap=gap, kinematics=kinematics)
+    first, _ = scene.solve_increment(side, 1.0)
+    scene.solve_increment(side, 1.0, along)
+    released, place = scene.solve_increment(0.0, 0.0, along)
     assert abs(place - along) < 1e-3
     assert first <= 10 and released <= 10
-    again, place = scene.go(side, 1.0, along)
+    reloaded, place = scene.solve_increment(side, 1.0, along)
     assert abs(place - along) < 2e-3
-    assert again <= 20
+    assert reloaded <= 20
 
 
 @pytest.mark.parametrize(
@@ -108,8 +108,8 @@ def test_block_moves_with_the_floor_while_it_is_unloaded(displacement, bulk, kin
     Reference: the displacement of the floor, to the strain (0.02). With small displacements the
     block was left behind, or the increment was refused.
     """
-    scene = Free("quadrilateral", bulk, kinematics=kinematics)
-    scene.go(3.0, 20.0)
+    scene = UnconstrainedBlock("quadrilateral", bulk, kinematics=kinematics)
+    scene.solve_increment(3.0, 20.0)
     scene.traction.value[:], scene.shift.value[:] = 0.0, displacement
     step = scene.problem.solve()
     displacements = gather(COMM, scene.contact.own_displacement())
@@ -122,10 +122,10 @@ def test_block_moves_with_the_floor_while_it_is_unloaded(displacement, bulk, kin
 def test_released_rubber_block_keeps_its_position_in_any_units(cell, size):
     """Rubber blocks in the plane and in space keep their position when released, to 1e-3."""
     units = {"size": size, "modulus": 1e3 / size**2}
-    scene = Free(cell, "rubber", n=2, gap=0.1, kinematics="finite", **units)
-    scene.go(0.1, 1.0)
-    _, pushed = scene.go(0.2, 1.0)
-    released, place = scene.go(0.0, 0.0)
+    scene = UnconstrainedBlock(cell, "rubber", n=2, gap=0.1, kinematics="finite", **units)
+    scene.solve_increment(0.1, 1.0)
+    _, pushed = scene.solve_increment(0.2, 1.0)
+    released, place = scene.solve_increment(0.0, 0.0)
     assert abs(place) < 1e-3 and abs(place - pushed) < 1e-3
     assert released <= 15
 
@@ -139,14 +139,14 @@ def test_block_is_constrained_if_all_points_slip(n, friction, bulk):
     Reference: the load, and the position, to the strain of 1e-3. Rubber took up to 67 iterations,
     or was refused.
     """
-    scene = Free("quadrilateral", bulk, n=n, friction=friction, kinematics="finite")
+    scene = UnconstrainedBlock("quadrilateral", bulk, n=n, friction=friction, kinematics="finite")
     for side, press in ((0.0, 1.0), (0.5 * friction, 1.0), (0.0, 0.0)):
-        iterations, place = scene.go(side, press)
+        iterations, place = scene.solve_increment(side, press)
         assert iterations <= 30
         assert abs(place) < 1e-3
 
 
-class OnASlab:
+class BlockOnSlab:
     """A block of rubber of size 1, with a traction on its top, on a slab that moves."""
 
     def __init__(self, slab, block, *, simplex):
@@ -173,7 +173,7 @@ class OnASlab:
         bcs = [dirichlet_bc(u, tags, RIGHT, i, value) for i, value in enumerate(self.place)]
         self.problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[self.contact])
 
-    def go(self, side, press, place=(0.0, 0.0)):
+    def solve_increment(self, side, press, place=(0.0, 0.0)):
         """Solve an increment with the slab displaced by ``place``, and commit."""
         self.traction.value[:] = side, -press
         for constant, value in zip(self.place, place, strict=True):
@@ -210,11 +210,11 @@ def test_block_in_a_bowl_slips_on_both_edges(kinematics, bulk):
 
     steps = list(fc.increments(problem, press, 0.0, load, steps=4, max_cuts=0))
     assert sum(step.iterations for step in steps) <= 40
-    found = contact.resultants()
-    assert found.stick + found.slip == 2  # one may be at its friction bound, still sticking
+    computed = contact.resultants()
+    assert computed.stick + computed.slip == 2  # one may be at its friction bound, still sticking
     x = np.abs(gather(COMM, contact.points)[:, 0]).max()
     sine, cosine = x / radius, np.sqrt(1 - (x / radius) ** 2)
-    assert is_close(found.normal_force, load / (cosine - friction * sine), 0.01)
+    assert is_close(computed.normal_force, load / (cosine - friction * sine), 0.01)
 
 
 def test_released_rubber_block_keeps_its_contact():
@@ -224,9 +224,9 @@ def test_released_rubber_block_keeps_its_contact():
     of 1e-11 between two points of Γc.
     """
     block, slab = np.linspace(0, 1, 3), np.linspace(-1, 2, 7)
-    scene = OnASlab([slab, np.linspace(-1.1, -0.1, 3)], [block - 0.06, block], simplex=True)
+    scene = BlockOnSlab([slab, np.linspace(-1.1, -0.1, 3)], [block - 0.06, block], simplex=True)
     for side, press in ((0.081, 1.0), (0.135, 1.0), (0.0, 0.0)):
-        scene.go(side, press)
+        scene.solve_increment(side, press)
     assert np.abs(scene.contact.gap).max(initial=0.0) < 1e-3
 
 
@@ -238,10 +238,10 @@ def test_released_block_is_positioned_on_the_slab_again():
     """
     slab = [np.linspace(-1, 3, 17), np.linspace(0, 1, 5)]
     block = [np.linspace(0.5, 1.5, 7), np.linspace(1.4, 2.4, 5)]
-    scene = OnASlab(slab, block, simplex=False)
-    scene.go(0.1, 1.0, (0.2, 0.1))
-    scene.go(0.0, 0.0, (0.2, 0.1))
-    step = scene.go(0.0, 1.0, (0.2, -0.2))
+    scene = BlockOnSlab(slab, block, simplex=False)
+    scene.solve_increment(0.1, 1.0, (0.2, 0.1))
+    scene.solve_increment(0.0, 0.0, (0.2, 0.1))
+    step = scene.solve_increment(0.0, 1.0, (0.2, -0.2))
     assert step.iterations <= 10
     assert is_close(scene.contact.resultants().force, [0.0, 1.0], 1e-8, scale=1.0)
 
@@ -264,16 +264,16 @@ def _stack(
         faces |= {2 * number - 1: at_coordinate(1, low), 2 * number: at_coordinate(1, high)}
     bodies = Bodies(boxes(axes, faces), 1e3, 0.3)
     bodies.F = NeoHookean(bodies.u, 1e3, 0.3, "plane strain").residual(bodies.v)
-    up, aside = bodies.constant(), bodies.constant()
+    up, slide = bodies.constant(), bodies.constant()
     bodies.prescribe(1, 0, 1)
-    bodies.prescribe(2 * len(blocks), 0, value=aside)
+    bodies.prescribe(2 * len(blocks), 0, value=slide)
     bodies.prescribe(2 * len(blocks), 1, value=up)
     law = fc.Coulomb(friction)
     contacts = [
         bodies.contact(2 * n + 1, 2 * n, law, name=f"joint {n}", kinematics="finite")
         for n in range(1, len(blocks))
     ]
-    return bodies.problem(*contacts), up, aside, bodies
+    return bodies.problem(*contacts), up, slide, bodies
 
 
 def _between_two(n: int, m: int) -> tuple[fc.ContactProblem, fem.Constant, Bodies]:
@@ -346,10 +346,10 @@ def test_block_with_previous_contact_force_is_not_ejected():
         (0.128, 0.757, 7, 0.697, 0.905),
         (0.290, 0.702, 5, 0.908, 1.199),
     ]
-    problem, up, aside, _ = _stack(blocks, 0.3)
+    problem, up, slide, _ = _stack(blocks, 0.3)
 
     def load(t):
-        up.value, aside.value = -0.0607 * min(1, 2 * t), 0.05 * max(0, 2 * t - 1)
+        up.value, slide.value = -0.0607 * min(1, 2 * t), 0.05 * max(0, 2 * t - 1)
 
     *_, last = fc.increments(problem, load, 0.0, 1.0, steps=4, max_cuts=4)
     force = last.contacts["joint 1"].force
@@ -374,9 +374,12 @@ def test_ejected_body_is_reported():
         for contact in problem.contacts:
             contact.evaluate()
         forces, start = problem.full.contact_forces(), problem.solver.equations.initial_forces
-        found = find_ejected_bodies(problem.full, problem.motions, forces, before, start)
-        assert [name.split(",")[0] for name in found] == names
-        assert all(is_close(np.array(ways)[[0, 2]], [2.0, 0.0], 1e-12) for ways in found.values())
+        ejected = find_ejected_bodies(problem.full, problem.motions, forces, before, start)
+        assert [name.split(",")[0] for name in ejected] == names
+        assert all(
+            is_close(np.array(displacements)[[0, 2]], [2.0, 0.0], 1e-12)
+            for displacements in ejected.values()
+        )
 
 
 @pytest.mark.parametrize(
@@ -460,17 +463,19 @@ def test_body_displaced_beyond_the_moving_floor_is_reported(displacement):
     References: the prescribed displacements: the block moves by `way` along the floor, which moves
     by 1, and by 0.5 away from it.
     """
-    scene = Free("quadrilateral", "linear", kinematics="finite")
+    scene = UnconstrainedBlock("quadrilateral", "linear", kinematics="finite")
     problem, u = scene.problem, scene.u
     scene.shift.value[0] = 1.0
     before = problem.full.state()
     u.interpolate(lambda x: np.vstack([displacement + 0.0 * x[0], 0.5 + 0.0 * x[0]]))
     scene.contact.evaluate()
     forces, start = problem.full.contact_forces(), problem.solver.equations.initial_forces
-    found = find_ejected_bodies(problem.full, problem.motions, forces, before, start)
-    assert len(found) == (displacement > 3.0)
+    ejected = find_ejected_bodies(problem.full, problem.motions, forces, before, start)
+    assert len(ejected) == (displacement > 3.0)
     expected = np.hypot(displacement, 0.5), 3.0, 1.0
-    assert all(is_close(np.array(ways), expected, 1e-12) for ways in found.values())
+    assert all(
+        is_close(np.array(displacements), expected, 1e-12) for displacements in ejected.values()
+    )
 
 
 def test_body_displaced_off_a_wall_by_a_ball_is_reported():
@@ -496,8 +501,11 @@ def test_body_displaced_off_a_wall_by_a_ball_is_reported():
     for contact in contacts:
         contact.evaluate()
     forces, start = problem.full.contact_forces(), problem.solver.equations.initial_forces
-    found = find_ejected_bodies(problem.full, problem.motions, forces, before, start)
-    assert [is_close(np.array(ways), (1.0, 0.06, 0.02), 1e-12) for ways in found.values()] == [True]
+    ejected = find_ejected_bodies(problem.full, problem.motions, forces, before, start)
+    assert [
+        is_close(np.array(displacements), (1.0, 0.06, 0.02), 1e-12)
+        for displacements in ejected.values()
+    ] == [True]
 
 
 @pytest.mark.parametrize(("displacement", "is_ejected"), [(2.5, False), (3.5, True)])
@@ -507,8 +515,8 @@ def test_residual_of_an_ejected_body_is_nan(displacement, is_ejected):
     Reference: the prescribed displacement, at most, or more than, three times that of the floor, 1;
     whether the residual is NaN.
     """
-    scene = Free("quadrilateral", "rubber", kinematics="finite")
-    scene.go(0.0, 1.0)
+    scene = UnconstrainedBlock("quadrilateral", "rubber", kinematics="finite")
+    scene.solve_increment(0.0, 1.0)
     problem, equations = scene.problem, scene.problem.solver.equations
     problem.full.load[:] = 0.0
     scene.shift.value[0] = 1.0
@@ -565,15 +573,15 @@ def test_block_left_on_the_floor_does_not_slow_newtons_method():
         fc.Contact(u, lower, fc.HalfSpace((0, 0), (0, 1)), fc.Coulomb(0.3), name="floor"),
     ]
     problem = fc.ContactProblem(F, u, contacts=contacts)
-    pressed, lifted, aside = (0.0, -1e-3), (0.0, 1e-3), (1e-3, 1e-3)
-    for place in (pressed, lifted, aside):
+    pressed, lifted, sheared = (0.0, -1e-3), (0.0, 1e-3), (1e-3, 1e-3)
+    for place in (pressed, lifted, sheared):
         grip.value[:] = place
         step = problem.solve()
         problem.commit()
         assert step.method == "newton"
         assert step.iterations <= 8
-        borne = contacts[2].resultants().normal_force
-        assert borne > 100.0 if place == pressed else borne < 1e-6
+        carried_force = contacts[2].resultants().normal_force
+        assert carried_force > 100.0 if place == pressed else carried_force < 1e-6
 
 
 def test_block_in_a_bowl_is_unloaded_and_loaded_again():
@@ -639,7 +647,7 @@ def test_friction_without_pressure_moves_the_block_with_the_floor(n, modulus, ki
         assert not equations.norms.is_within(1e-9)
 
 
-class Pushed:
+class PushedBlock:
     """An unloaded block, a driven block at its left, a gap of 0.2 between them, and a ball.
 
     The ball, with finite kinematics only, is 0.1 above the block and has its centre at x = 1.15.
@@ -666,33 +674,33 @@ class Pushed:
             low = np.array(low)
             return Box(low, size, n=(4, 4), bend=lambda x: (x + low) @ self.turn.T - low)
 
-        made = {"pushed": box((place, 0.0), (1.0, 1.0)), "led": box((-1.2, 0.1), (1.0, 0.8))}
+        boxes = {"pushed": box((place, 0.0), (1.0, 1.0)), "driven": box((-1.2, 0.1), (1.0, 0.8))}
         if far:
-            made["unrelated"] = Box((far, far), n=(2, 2))
-        scene = SceneWithUnrelatedBodies(made, E=1e3, rubber=rubber)
+            boxes["unrelated"] = Box((far, far), n=(2, 2))
+        scene = SceneWithUnrelatedBodies(boxes, E=1e3, rubber=rubber)
         if far:
             for component in range(2):
                 scene.prescribe("unrelated", LEFT, component)
-        self._led = [scene.bodies.constant(0.0) for _ in range(2)]
+        self._driven = [scene.bodies.constant(0.0) for _ in range(2)]
         self.down = scene.bodies.constant((0.0, 0.0))
-        for component, constant in enumerate(self._led):
-            scene.prescribe("led", LEFT, component, value=constant)
-        meets = {BOTTOM: fc.HalfSpace((0, 0), self.turn[:, 1]), LEFT: ("led", RIGHT)}
+        for component, constant in enumerate(self._driven):
+            scene.prescribe("driven", LEFT, component, value=constant)
+        meets = {BOTTOM: fc.HalfSpace((0, 0), self.turn[:, 1]), LEFT: ("driven", RIGHT)}
         if kinematics == "finite":
             meets[TOP] = fc.Ball(self.turn @ (1.15, 3.1), 2.0, displacement=self.down)
         law = law or fc.Coulomb(0.3)
         more = {"kinematics": kinematics, "enforcement": enforcement}
         self.contacts = [
-            scene.contact("pushed", side, what, law, name=f"{side}", **more)
-            for side, what in meets.items()
+            scene.contact("pushed", side, obstacle, law, name=f"{side}", **more)
+            for side, obstacle in meets.items()
         ]
         self.problem = scene.problem(*self.contacts, **options)
 
     def step(self, along=None):
         """Solve and commit an increment, with the driven block displaced to ``along`` if given."""
         if along is not None:
-            for constant, share in zip(self._led, self.turn[:, 0], strict=True):
-                constant.value = share * along
+            for constant, component in zip(self._driven, self.turn[:, 0], strict=True):
+                constant.value = component * along
         self.problem.solve()
         self.problem.commit()
 
@@ -729,7 +737,7 @@ def test_unloaded_block_stays_where_another_block_pushed_it(kinematics, rubber, 
     The block was moved back with the other one; and L-BFGS, to which all positions are equivalent,
     lifted it.
     """
-    Pushed(kinematics=kinematics, rubber=rubber, **options).push(n_steps)
+    PushedBlock(kinematics=kinematics, rubber=rubber, **options).push(n_steps)
 
 
 @pytest.mark.parametrize("rubber", [False, True])
@@ -737,7 +745,7 @@ def test_displaced_block_carries_the_force_of_a_ball(rubber):
     """Reference: the force on the ball if the block is meshed there, to 1e-6; it was zero."""
     forces = []
     for place in (0.0, 0.65):
-        scene = Pushed(place, rubber=rubber)
+        scene = PushedBlock(place, rubber=rubber)
         if place:
             scene.step()
         else:

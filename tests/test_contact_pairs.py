@@ -65,7 +65,7 @@ def disc(centre: Sequence[float], radius: float, n: int) -> tuple:
     return create_mesh("triangle", x + np.asarray(centre, float), cells), None, None
 
 
-class Pressed:
+class PressedBodies:
     """Joined bodies with ν = 0, some with pressure on the ROOF, some with a fixed FLOOR.
 
     All have rollers at WEST and SOUTH and are free on the other sides.
@@ -75,7 +75,7 @@ class Pressed:
         self,
         parts: dict[str, tuple],
         pressed: dict[str, float],
-        held: Sequence[str],
+        fixed_bodies: Sequence[str],
         moduli: dict[str, float] | None = None,
         degree: int = 1,
     ) -> None:
@@ -92,13 +92,15 @@ class Pressed:
         for body, pressure in pressed.items():
             load = fem.Constant(self.mesh, pressure)
             self.F += load * self.v[self.d - 1] * ds(joined.facet(body, ROOF))
-        self.bcs = [self.hold(body, FLOOR, self.d - 1) for body in held]
+        self.bcs = [self.fix_component(body, FLOOR, self.d - 1) for body in fixed_bodies]
         for body in parts:
-            self.bcs += [self.hold(body, side, i) for i, side in enumerate((WEST, SOUTH)[:-1])]
+            self.bcs += [
+                self.fix_component(body, side, i) for i, side in enumerate((WEST, SOUTH)[:-1])
+            ]
             if self.d == 3:
-                self.bcs.append(self.hold(body, SOUTH, 1))
+                self.bcs.append(self.fix_component(body, SOUTH, 1))
 
-    def hold(self, body: str, tag: int, component: int) -> fem.DirichletBC:
+    def fix_component(self, body: str, tag: int, component: int) -> fem.DirichletBC:
         """Return a condition that fixes one displacement component of a side."""
         return dirichlet_bc(self.u, self.joined.facets, self.joined.facet(body, tag), component)
 
@@ -109,7 +111,7 @@ class Pressed:
         problem.commit()
         return step
 
-    def shortened(self, body: str) -> Array:
+    def roof_shortening(self, body: str) -> Array:
         """Return the downward displacements of the nodes of a body's ROOF."""
         facets = self.joined.facets.find(self.joined.facet(body, ROOF))
         space = self.u.function_space.sub(self.d - 1)
@@ -117,7 +119,7 @@ class Pressed:
         return gather(COMM, -self.u.x.array[dofs])
 
 
-def three_blocks(cell: str) -> Pressed:
+def three_blocks(cell: str) -> PressedBodies:
     """Return a stack of three blocks of height 0.5, 3, 5 (3D: 2) and 4 cells wide, pressed by 2."""
     d = dimension(cell)
     parts = {}
@@ -125,15 +127,15 @@ def three_blocks(cell: str) -> Pressed:
         low, high = [0.0] * (d - 1) + [0.5 * i], [1.0] * (d - 1) + [0.5 * (i + 1)]
         parts[body] = box(cell, low, high, [n] * (d - 1) + [2])
     moduli = {"low": 1e3, "mid": 2e3, "top": 5e2}
-    return Pressed(parts, {"top": 2.0}, ["low"], moduli)
+    return PressedBodies(parts, {"top": 2.0}, ["low"], moduli)
 
 
-def up(contact: fc.Contact) -> float:
+def vertical_force(contact: fc.Contact) -> float:
     """Return the vertical contact force on the slave body."""
     return float(contact.resultants().force[-1])
 
 
-def facets_of(contact: fc.Contact) -> int:
+def n_facets_of(contact: fc.Contact) -> int:
     """Return the number of facets of Γc."""
     return COMM.allreduce(len(contact.surface.facets))
 
@@ -152,18 +154,18 @@ def test_stack_has_uniform_stress_and_the_load_in_every_joint(cell: str) -> None
     scene.solve(contacts)
     bound = 0.0
     for contact in contacts:
-        assert abs(up(contact)) == pytest.approx(2.0, rel=1e-10)
+        assert abs(vertical_force(contact)) == pytest.approx(2.0, rel=1e-10)
         pressure = gather(COMM, contact.pressure)
         assert pressure == pytest.approx(np.full(pressure.shape, 2.0), rel=1e-9)
         bound += contact.resultants().max_penetration
     expected = 2.0 * 0.5 * (1 / 1e3 + 1 / 2e3 + 1 / 5e2) + bound
-    found = scene.shortened("top")
-    assert found == pytest.approx(np.full(found.shape, expected), rel=1e-9)
+    shortening = scene.roof_shortening("top")
+    assert shortening == pytest.approx(np.full(shortening.shape, expected), rel=1e-9)
 
 
 def test_found_pairs_equal_contacts_of_tagged_sides() -> None:
     """Contacts of tagged sides give the same displacements and forces, to 1e-8."""
-    found = []
+    computed = []
     for by_hand in (False, True):
         scene = three_blocks("quadrilateral")
         law, tags, joined = fc.Coulomb(0.3), scene.joined.facets, scene.joined
@@ -171,18 +173,20 @@ def test_found_pairs_equal_contacts_of_tagged_sides() -> None:
             contacts = [
                 fc.Contact(
                     scene.u,
-                    fc.ContactSurface(scene.mesh, tags, joined.facet("mid", here)),
-                    fc.DeformableBody(tags, joined.facet(body, there)),
+                    fc.ContactSurface(scene.mesh, tags, joined.facet("mid", slave)),
+                    fc.DeformableBody(tags, joined.facet(body, master)),
                     law,
                     name=body,
                 )
-                for body, here, there in (("low", FLOOR, ROOF), ("top", ROOF, FLOOR))
+                for body, slave, master in (("low", FLOOR, ROOF), ("top", ROOF, FLOOR))
             ]
         else:
             contacts = fc.find_contact_pairs(scene.u, law, 0.1, bodies=joined)
         scene.solve(contacts)
-        found.append([scene.shortened("top"), *(np.array([up(c)]) for c in contacts)])
-    for one, other in zip(*found, strict=True):
+        computed.append(
+            [scene.roof_shortening("top"), *(np.array([vertical_force(c)]) for c in contacts)]
+        )
+    for one, other in zip(*computed, strict=True):
         assert np.sort(one) == pytest.approx(np.sort(other), rel=1e-8)
 
 
@@ -195,7 +199,7 @@ def test_two_blocks_on_one_base(fine: str) -> None:
         "left": box("quadrilateral", (0, 1), (0.98, 2), (n[1], 2)),
         "right": box("quadrilateral", (1.02, 1), (2, 2), (n[1], 2)),
     }
-    scene = Pressed(parts, {"left": 3.0, "right": 5.0}, ["base"])
+    scene = PressedBodies(parts, {"left": 3.0, "right": 5.0}, ["base"])
     contacts = fc.find_contact_pairs(scene.u, fc.Frictionless(), 0.1, bodies=scene.joined)
     names = [contact.name for contact in contacts]
     # The blocks face each other across the gap, which stays open.
@@ -265,16 +269,16 @@ def test_rubber_disc_between_plates() -> None:
     The disc is constrained laterally only. The plates are farther apart than the search distance
     and no pair.
     """
-    found, expected = rubber_between_plates(by_hand=False), rubber_between_plates(by_hand=True)
-    assert [contact.name for contact in found] == ["below-disc", "disc-above"]
-    below, above = (up(contact) for contact in found)
+    computed, expected = rubber_between_plates(by_hand=False), rubber_between_plates(by_hand=True)
+    assert [contact.name for contact in computed] == ["below-disc", "disc-above"]
+    below, above = (vertical_force(contact) for contact in computed)
     assert below > 0.02 and below == pytest.approx(-above, rel=1e-8)
-    for one, other in zip(found, expected, strict=True):
-        assert facets_of(one) < facets_of(other)
-        assert up(one) == pytest.approx(up(other), rel=1e-7)
+    for one, other in zip(computed, expected, strict=True):
+        assert n_facets_of(one) < n_facets_of(other)
+        assert vertical_force(one) == pytest.approx(vertical_force(other), rel=1e-7)
 
 
-def fork(seed: int | None = None) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
+def slotted_square(seed: int | None = None) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
     """Return mesh and tags of a unit square with a slot 0.1 wide from its top down to y = 0.2.
 
     The order of its cells is random if a seed is given.
@@ -301,9 +305,9 @@ def fork(seed: int | None = None) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshT
 
 def test_self_contact_equals_contact_of_tagged_sides() -> None:
     """The legs of a fork pressed together have the force of tagged slot faces, to 1e-7."""
-    found = []
+    computed = []
     for by_hand in (False, True):
-        mesh, tags = fork()
+        mesh, tags = slotted_square()
         u = fem.Function(displacement_space(mesh, 1))
         v = ufl.TestFunction(u.function_space)
         squeeze = fem.Constant(mesh, 0.7)
@@ -323,9 +327,9 @@ def test_self_contact_equals_contact_of_tagged_sides() -> None:
         problem = fc.ContactProblem(F, u, bcs=bcs, contacts=contacts)
         for _ in fc.increments(problem, squeeze, 0.0, 0.7, steps=2):
             pass
-        found.append((contact, abs(contact.resultants().force[0])))
-        assert facets_of(contact) == 8
-    (first, one), (_, other) = found
+        computed.append((contact, abs(contact.resultants().force[0])))
+        assert n_facets_of(contact) == 8
+    (first, one), (_, other) = computed
     assert first.name == "1-1"
     # Γc may be on the other leg, which is the mirror image.
     assert one > 0.05 and one == pytest.approx(other, rel=1e-7)
@@ -334,7 +338,7 @@ def test_self_contact_equals_contact_of_tagged_sides() -> None:
 def test_slave_side_of_self_contact_is_independent_of_cell_numbering() -> None:
     """Γc is the left side of the slot for any numbering of cells and any number of ranks."""
     for seed in range(5):
-        mesh, _ = fork(seed)
+        mesh, _ = slotted_square(seed)
         u = fem.Function(displacement_space(mesh, 1))
         (contact,) = fc.find_contact_pairs(u, fc.Frictionless(), 0.12, self_contact=True)
         assert np.allclose(gather(mesh.comm, contact.points)[:, 0], 0.45)
@@ -354,7 +358,7 @@ def test_all_facets_of_a_hole_are_slave_and_master(caplog: pytest.LogCaptureFixt
         (contact,) = fc.find_contact_pairs(
             u, fc.Frictionless(), 2.0, self_contact=True, kinematics="finite"
         )
-    assert facets_of(contact) == 16
+    assert n_facets_of(contact) == 16
     points = gather(COMM, contact.gap)
     # The gap across the hole at the middle of facets is the diameter of the inscribed circle.
     assert points.min() == pytest.approx(2 * np.cos(np.pi / 16))
@@ -382,7 +386,7 @@ def test_bodies_far_apart_are_not_paired(caplog: pytest.LogCaptureFixture) -> No
         # Γc is on the finer disc; its vertex is at distance 1 from the vertex of the other.
         assert "1-2: Γc on 2 with" in caplog.text and "; 1 to 1." in caplog.text
     x = gather(COMM, contact.points)
-    assert np.all(x[:, 0] > 1.9) and facets_of(contact) > 3
+    assert np.all(x[:, 0] > 1.9) and n_facets_of(contact) > 3
 
 
 def test_back_sides_are_not_paired() -> None:
@@ -414,7 +418,7 @@ def test_initial_overlap_is_found_up_to_half_a_cell() -> None:
         assert len(contacts) == n_contacts
         for contact in contacts:
             gap = gather(COMM, contact.gap)
-            assert facets_of(contact) == 5 and gap == pytest.approx(np.full(len(gap), -depth))
+            assert n_facets_of(contact) == 5 and gap == pytest.approx(np.full(len(gap), -depth))
 
 
 def test_choice_of_the_slave_side() -> None:
@@ -428,7 +432,7 @@ def test_choice_of_the_slave_side() -> None:
         joined = fc.join_meshes(parts)
         u = fem.Function(displacement_space(joined.mesh, 1))
         (contact,) = fc.find_contact_pairs(u, law, 0.3, bodies=joined)
-        on_upper = facets_of(contact) == n
+        on_upper = n_facets_of(contact) == n
         assert on_upper == bool(expected), (n, width)
         for order, chosen in (((0,), 0), ((1,), 1), ((1, 0), 1), ((0, 1), 0)):
             (contact,) = fc.find_contact_pairs(u, law, 0.3, bodies=joined, slave_bodies=order)
@@ -449,7 +453,7 @@ def test_bodies_are_named_by_cell_tags_or_connected_parts() -> None:
     )
     for bodies, name in ((None, "1-2"), (joined, "a-b"), (tags, "10-20")):
         (contact,) = fc.find_contact_pairs(u, fc.Frictionless(), 0.1, bodies=bodies)
-        assert contact.name == name and facets_of(contact) == 4
+        assert contact.name == name and n_facets_of(contact) == 4
     floors = [joined.facet(body, FLOOR) for body in "ab"]
     only = {"facet_tags": joined.facets, "tags": floors}
     assert fc.find_contact_pairs(u, fc.Frictionless(), 0.1, **only) == []
@@ -460,16 +464,16 @@ def test_bodies_are_named_by_cell_tags_or_connected_parts() -> None:
 def test_law_can_be_a_function_of_the_pair() -> None:
     """A callable law is called with the names of both bodies."""
     scene = three_blocks("quadrilateral")
-    asked = []
+    calls = []
 
     def law(a: Any, b: Any) -> fc.Law:
-        asked.append((a, b))
+        calls.append((a, b))
         return fc.Coulomb(0.3) if a == "low" else fc.Frictionless()
 
     contacts = fc.find_contact_pairs(
         scene.u, law, 0.1, bodies=scene.joined, enforcement="augmented"
     )
-    assert asked == [("low", "mid"), ("mid", "top")]
+    assert calls == [("low", "mid"), ("mid", "top")]
     assert [contact.law.has_friction for contact in contacts] == [True, False]
     assert all(contact.multipliers is not None for contact in contacts)
 
@@ -483,7 +487,7 @@ def test_invalid_arguments_are_reported_on_every_rank() -> None:
     half = joined.cells.indices[joined.cells.values == 1]
     some = dolfinx.mesh.meshtags(joined.mesh, 2, half, np.ones(len(half), dtype=np.int32))
     ready: dict[str, Any] = {"u": u, "law": law, "distance": 0.1}
-    for given, words in (
+    for options, words in (
         ({"u": 3}, ["find_contact_pairs: u is"]),
         ({"distance": 0.0}, ["distance is 0.0", "greater than zero"]),
         ({"distance": "near"}, ["'near'"]),
@@ -504,7 +508,7 @@ def test_invalid_arguments_are_reported_on_every_rank() -> None:
         ({"kinematics": "large"}, ["'large'"]),
         ({"update_pairs": "often"}, ["'often'"]),
     ):
-        arguments = ready | given
+        arguments = ready | options
         assert_raised_on_all_ranks(
             lambda a=arguments: fc.find_contact_pairs(**a), ValueError, *words
         )

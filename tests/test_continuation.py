@@ -120,10 +120,10 @@ def test_continuation_does_not_affect_the_history():
     ends = []
     for method in ("continuation", "lbfgs"):
         law = fc.Coulomb(0.3, fc.RelativeStiffness(100), fc.RelativeStiffness(100))
-        made = BlockOnBall(law, mesh={"n": 8}, amplitude=0.05, method=method)
-        steps = list(fc.increments(made.problem, made.load, 0.0, 4.0, steps=8))
+        setup = BlockOnBall(law, mesh={"n": 8}, amplitude=0.05, method=method)
+        steps = list(fc.increments(setup.problem, setup.load, 0.0, 4.0, steps=8))
         assert all(step.energy.dissipation >= 0 for step in steps)
-        ends.append(nodal_values(made.scene.u))
+        ends.append(nodal_values(setup.scene.u))
     assert is_close(*ends, 1e-5)
 
 
@@ -135,23 +135,23 @@ def test_cut_increments_list_all_attempts():
     problem, _ = scene.problem(fc.Frictionless(k_n=1e4), bcs, method="lbfgs", fallback=False)
     solve, fail = problem.solve, [True, True, False]
 
-    def failing(**kwargs):
-        problem.solver.main.max_it, kept = (
+    def raise_error(**kwargs):
+        problem.solver.main.max_it, max_it = (
             (0 if fail.pop(0) else problem.solver.main.max_it),
             problem.solver.main.max_it,
         )
         try:
             return solve(**kwargs)
         finally:
-            problem.solver.main.max_it = kept
+            problem.solver.main.max_it = max_it
             fail.append(False)
 
-    problem.solve = failing
-    first, *rest = fc.increments(problem, push, 0.0, -0.01)
+    problem.solve = raise_error
+    first, *remaining = fc.increments(problem, push, 0.0, -0.01)
     names = [attempt.method for attempt in first.attempts]
     assert names == ["lbfgs", "cut", "lbfgs", "cut", "lbfgs"]
     assert [attempt.outcome for attempt in first.attempts[1::2]] == ["to 0.005", "to 0.0025"]
-    assert first.load == -0.0025 and all(len(step.attempts) == 1 for step in rest)
+    assert first.load == -0.0025 and all(len(step.attempts) == 1 for step in remaining)
 
 
 def test_finite_kinematics_with_friction_start_with_newton():
@@ -164,8 +164,8 @@ def test_finite_kinematics_with_friction_start_with_newton():
     for kinematics in ("small", "finite"):
         scene = block("triangle", 1, n=6, E=100.0)
         bcs = [scene.dirichlet_bc(TOP, i, value) for i, value in enumerate((0.005, -0.01))]
-        law, given = fc.Coulomb(0.3, k_n=1e3, k_t=1e3), {"kinematics": kinematics}
-        step = scene.problem(law, bcs, contact=given)[0].solve()
+        law, options = fc.Coulomb(0.3, k_n=1e3, k_t=1e3), {"kinematics": kinematics}
+        step = scene.problem(law, bcs, contact=options)[0].solve()
         forces.append(step.contacts["contact"].force)
         attempts = step.attempts
     assert [a.method for a in attempts] == ["newton"]

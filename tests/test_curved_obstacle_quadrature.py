@@ -42,21 +42,21 @@ SHAPES = {
 }
 
 
-def forces(shape, length, *, quadrature=None, degree=1, **options):
+def normal_forces_of_tool(shape, length, *, quadrature=None, degree=1, **options):
     """Return normal forces of a tool 0.3 deep at two positions along a facet, and the contact."""
-    found = []
-    for share in (0.0, 0.35):
+    computed = []
+    for factor in (0.0, 0.35):
         up = np.linspace(-5.0, 0.0, 4)
         sides = {1: at_coordinate(1, -5.0), 2: at_coordinate(1, 0.0)}
         across = length * np.arange(-4.0, 5.0)
         block = Bodies(boxes([[across, up]], sides), 1000.0, 0.3, degree=degree)
         block.prescribe(1, 0, 1)
-        tool = SHAPES[shape](np.array([share * length, RADIUS - 0.3]))
+        tool = SHAPES[shape](np.array([factor * length, RADIUS - 0.3]))
         options = {"kinematics": "finite"} | options
         contact = block.contact(2, tool, fc.Coulomb(0.3), quadrature=quadrature, **options)
         block.problem(contact).solve()
-        found.append(contact.resultants().normal_force)
-    return np.array(found), contact
+        computed.append(contact.resultants().normal_force)
+    return np.array(computed), contact
 
 
 @pytest.mark.each
@@ -70,10 +70,10 @@ def test_facets_resolve_a_round_tool(shape, length, enforcement):
     With two points, or at nodes, the error was up to 26 % with penalty, and with multipliers no
     point was closed in the middle of the longer facets.
     """
-    found, contact = forces(shape, length, enforcement=enforcement)
-    fine, _ = forces(shape, length, enforcement=enforcement, quadrature=78)
+    computed, contact = normal_forces_of_tool(shape, length, enforcement=enforcement)
+    fine, _ = normal_forces_of_tool(shape, length, enforcement=enforcement, quadrature=78)
     assert contact.quadrature.degree // 2 + 1 >= 4 * length / RADIUS
-    assert np.all(np.abs(found / fine - 1) < 0.04)
+    assert np.all(np.abs(computed / fine - 1) < 0.04)
 
 
 def test_default_points_where_the_radius_is_resolved():
@@ -105,14 +105,16 @@ def test_insufficient_points_cause_a_warning(enforcement):
 
     Reference: with the proposed degree the force is that of 40 points, to 4 %.
     """
-    with pytest.warns(UserWarning, match="as long as the radius of curvature") as told:
-        forces("distance", 2.0, enforcement=enforcement)
-    degree = int(str(told[0].message).split("quadrature_degree=")[1].split(")")[0])
+    with pytest.warns(UserWarning, match="as long as the radius of curvature") as caught:
+        normal_forces_of_tool("distance", 2.0, enforcement=enforcement)
+    degree = int(str(caught[0].message).split("quadrature_degree=")[1].split(")")[0])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found, _ = forces("distance", 2.0, enforcement=enforcement, quadrature=degree)
-        forces("cylinder", 2.0, enforcement=enforcement)
+        computed, _ = normal_forces_of_tool(
+            "distance", 2.0, enforcement=enforcement, quadrature=degree
+        )
+        normal_forces_of_tool("cylinder", 2.0, enforcement=enforcement)
         if enforcement == "penalty":
-            forces("distance", 0.5)
-    fine, _ = forces("distance", 2.0, enforcement=enforcement, quadrature=78)
-    assert is_close(found, fine, 0.04)
+            normal_forces_of_tool("distance", 0.5)
+    fine, _ = normal_forces_of_tool("distance", 2.0, enforcement=enforcement, quadrature=78)
+    assert is_close(computed, fine, 0.04)

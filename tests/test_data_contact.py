@@ -27,7 +27,7 @@ COMM = MPI.COMM_WORLD
 HISTORY = [(0.0, -0.06, 0.0), (0.04, -0.12, 0.1), (-0.02, -0.1, 0.3)]
 
 
-def pressed(cell, obstacle, *, law=None, unit=1.0, degree=1, cross_check=False, **contact):
+def tool_forces(cell, obstacle, *, law=None, unit=1.0, degree=1, cross_check=False, **contact):
     """Return the forces on the body while a tool is pressed, dragged and rotated, (n, gdim)."""
     scene = rubber(cell, degree, n=(8, 4) if cell == "triangle" else (4, 2), E=1000.0)
     scene.mesh.geometry.x[:] *= unit
@@ -36,13 +36,13 @@ def pressed(cell, obstacle, *, law=None, unit=1.0, degree=1, cross_check=False, 
     tool = obstacle(shift, angle)
     law = law or fc.Coulomb(0.3, 1e4 / unit, 1e4 / unit)
     options = {"petsc_options": TIGHT_TOLERANCE, "cross_check": cross_check}
-    problem, made = scene.problem(tool, law, contact=contact, **options)
+    problem, body_contact = scene.problem(tool, law, contact=contact, **options)
     forces = []
     for side, up, turn in HISTORY:
         shift.value[0], shift.value[-1], angle.value = unit * side, unit * up, turn
         problem.solve()
         problem.commit()
-        forces.append(made.resultants().force)
+        forces.append(body_contact.resultants().force)
     return np.array(forces) / unit ** (d - 1)
 
 
@@ -51,7 +51,7 @@ def length(x):
     return ufl.sqrt(ufl.dot(x, x))
 
 
-def tool(d, shape, unit=1.0):
+def tool_maker(d, shape, unit=1.0):
     """Return a function that makes a `disc` of radius 0.8 from its displacement and angle."""
 
     def make(shift, angle):
@@ -89,7 +89,7 @@ def test_spline_agrees_with_the_cylinder(cell, enforcement):
     """
     d = 2 if cell == "triangle" else 3
     options = {"enforcement": enforcement, "tolerance": 1e-8}
-    one, other = (pressed(cell, tool(d, s), **options) for s in ("cylinder", "spline"))
+    one, other = (tool_forces(cell, tool_maker(d, s), **options) for s in ("cylinder", "spline"))
     assert np.abs(one[-1]).min() >= 0 and abs(one[1, 0]) > 1.0
     assert is_close(other, one, 1e-6)
 
@@ -104,12 +104,14 @@ def test_faceted_ball_converges_to_the_ball(cell):
     """
     d = 2 if cell == "triangle" else 3
     law = fc.Frictionless(1e4)
-    exact = pressed(cell, tool(d, "distance"), law=law)
+    exact = tool_forces(cell, tool_maker(d, "distance"), law=law)
     sizes = (24, 96, 384) if d == 2 else (3, 4, 5)
-    errors = [np.abs(pressed(cell, tool(d, n), law=law) - exact) for n in sizes]
-    up, aside = (np.array([e[:, part].max() for e in errors]) for part in (-1, slice(0, -1)))
+    errors = [np.abs(tool_forces(cell, tool_maker(d, n), law=law) - exact) for n in sizes]
+    up, tangential_error = (
+        np.array([e[:, part].max() for e in errors]) for part in (-1, slice(0, -1))
+    )
     assert up[0] / up[-1] > (128.0 if d == 2 else 8.0)
-    assert aside[0] / aside[-1] > (8.0 if d == 2 else 2.0)
+    assert tangential_error[0] / tangential_error[-1] > (8.0 if d == 2 else 2.0)
     assert up[-1] < 5e-3 * np.abs(exact).max()
 
 
@@ -119,9 +121,9 @@ def test_forces_are_independent_of_the_unit_of_length(shape):
 
     Nodal forces of every solution with unit 1 agree with those assembled from the boundary form.
     """
-    one = pressed("triangle", tool(2, shape), cross_check=True)
+    one = tool_forces("triangle", tool_maker(2, shape), cross_check=True)
     for unit in (1e-6, 1e6):
-        assert is_close(pressed("triangle", tool(2, shape, unit), unit=unit), one, 1e-7)
+        assert is_close(tool_forces("triangle", tool_maker(2, shape, unit), unit=unit), one, 1e-7)
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
@@ -178,7 +180,9 @@ def test_user_defined_sampled_ball_agrees_with_ball():
     def bubble(shift, angle):
         return Bubble((0.0, 1.8), 0.8, shift, fc.Rotation(angle, (0.0, 1.8)))
 
-    assert is_close(pressed("triangle", bubble), pressed("triangle", tool(2, "ball")), 1e-9)
+    assert is_close(
+        tool_forces("triangle", bubble), tool_forces("triangle", tool_maker(2, "ball")), 1e-9
+    )
 
 
 class NoDistance(Bubble):
@@ -192,9 +196,9 @@ class NoDistance(Bubble):
     def sample(self, x):
         """Sample the ball with its wrong distance and normal."""
         c, s = np.cos(self.tilt), np.sin(self.tilt)
-        found = super().sample(x)
-        normal = found.normal @ np.array([[c, s], [-s, c]])
-        return fc.Sample(self.scale * found.distance, normal, found.curvature)
+        sample = super().sample(x)
+        normal = sample.normal @ np.array([[c, s], [-s, c]])
+        return fc.Sample(self.scale * sample.distance, normal, sample.curvature)
 
 
 @pytest.mark.whole
@@ -204,10 +208,10 @@ def test_samples_that_are_no_distance_are_refused(scale, tilt, kinematics):
     """Twice the distance was accepted, with twice the force, and so was an inclined normal."""
     scene = block("triangle", 1, n=6)
     up = fem.Constant(scene.mesh, np.zeros(2))
-    given = {"obstacle": NoDistance(scale, tilt, up), "kinematics": kinematics}
+    options = {"obstacle": NoDistance(scale, tilt, up), "kinematics": kinematics}
     bcs = [scene.dirichlet_bc(TOP, 0), scene.dirichlet_bc(TOP, 1)]
     problem, _ = scene.problem(
-        fc.Frictionless(1e3), bcs, contact=given, small_displacement_tolerance=np.inf
+        fc.Frictionless(1e3), bcs, contact=options, small_displacement_tolerance=np.inf
     )
     up.value[1] = 0.02
     if scale == 1.0 and tilt == 0.0:
@@ -229,9 +233,9 @@ def test_gradient_error_is_small_at_edges_and_corners(shape, spread):
     if shape == "profile":
         corners = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2.0]])
         obstacle: fc.SampledObstacle = fc.RigidProfile(corners, closed=True)
-        share = rng.uniform(size=(500, 1)) * (rng.uniform(size=(500, 1)) < 0.7)
+        fraction = rng.uniform(size=(500, 1)) * (rng.uniform(size=(500, 1)) < 0.7)
         k = rng.integers(len(corners), size=500)
-        x = (1 - share) * corners[k] + share * np.roll(corners, -1, axis=0)[k]
+        x = (1 - fraction) * corners[k] + fraction * np.roll(corners, -1, axis=0)[k]
     else:
         corners = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1.0)])
         sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -279,8 +283,8 @@ def test_error_of_a_sample_during_the_iteration_is_raised(fault, error, text):
     scene = block("triangle", 1, n=4)
     down = fem.Constant(scene.mesh, 0.0)
     bcs = [scene.dirichlet_bc(TOP, 0), scene.dirichlet_bc(TOP, 1, down)]
-    given = {"obstacle": Faulty(fault), "kinematics": "finite"}
-    problem, contact = scene.problem(fc.Coulomb(0.3), bcs, contact=given)
+    options = {"obstacle": Faulty(fault), "kinematics": "finite"}
+    problem, contact = scene.problem(fc.Coulomb(0.3), bcs, contact=options)
     problem.solve()
     problem.commit()
     down.value = -0.01
@@ -293,9 +297,9 @@ def test_error_of_a_sample_during_the_iteration_is_raised(fault, error, text):
 @pytest.mark.parametrize("missing", ["gdim", "fingerprint", "sample"])
 def test_missing_members_of_a_sampled_obstacle_are_named(missing):
     """The error names the missing member of a subclass when the contact is made."""
-    said = {"gdim": 2, "fingerprint": "flat", "sample": Faulty.sample}
-    del said[missing]
-    obstacle = type("Floor", (fc.SampledObstacle,), said)()
+    members = {"gdim": 2, "fingerprint": "flat", "sample": Faulty.sample}
+    del members[missing]
+    obstacle = type("Floor", (fc.SampledObstacle,), members)()
     scene = block("triangle", 1)
     words = "Floor is no obstacle", f"must define {missing}"
     assert_raised_on_all_ranks(
@@ -319,11 +323,11 @@ def test_obstacle_without_place_is_refused():
 
 def test_sample_of_wrong_shape_is_refused():
     """The error states the required shape when the contact is first evaluated."""
-    given = {"obstacle": Faulty("shape"), "kinematics": "finite"}
+    options = {"obstacle": Faulty("shape"), "kinematics": "finite"}
     scene = block("triangle", 1)
     words = "Faulty: distance of its sample has shape", "must be"
     assert_raised_on_all_ranks(
-        scene.contact(fc.Frictionless(), **given).evaluate, ValueError, *words
+        scene.contact(fc.Frictionless(), **options).evaluate, ValueError, *words
     )
 
 
@@ -331,18 +335,18 @@ def test_checkpoint_of_another_profile_is_refused(tmp_path):
     """A history cannot be restarted on a profile with one more point."""
     path = shared_folder(tmp_path) / "state.npz"
 
-    def made(n):
+    def make_setup(n):
         scene = rubber("triangle", 1, n=(4, 2))
         profile = fc.RigidProfile(circle(n, 0.8, (0, 1.75)), closed=True)
         return scene.problem(profile, fc.Frictionless(1e4))[0]
 
-    problem = made(60)
+    problem = make_setup(60)
     problem.solve()
     problem.commit()
     fc.checkpoint.save(problem, path)
-    fc.checkpoint.load(made(60), path)
+    fc.checkpoint.load(make_setup(60), path)
     assert_raised_on_all_ranks(
-        lambda: fc.checkpoint.load(made(61), path), ValueError, "RigidProfile"
+        lambda: fc.checkpoint.load(make_setup(61), path), ValueError, "RigidProfile"
     )
 
 
@@ -351,7 +355,7 @@ def test_checkpoint_of_another_profile_is_refused(tmp_path):
 @pytest.mark.parametrize("shape", ["ball", "profile", "facets"])
 def test_tractions_rotate_with_the_whole_scene(cell, shape):
     """A common rigid motion of body and tool, over a history, only rotates tractions: 1e-9."""
-    found = []
+    computed = []
     angle_, d = 2.1, 2 if cell == "triangle" else 3
     for moved in (False, True):
         scene = rubber(cell, 1, n=(6, 3) if d == 2 else (4, 2))
@@ -360,27 +364,27 @@ def test_tractions_rotate_with_the_whole_scene(cell, shape):
         contact = scene.contact(obstacle, fc.Coulomb(0.3, 1e3, 1e3))
         centre = np.array((0.0,) * (d - 1) + (1.8,))
         for number in range(3):
-            own = 0.04 * np.cos(number + np.arange(d))
+            body_motion = 0.04 * np.cos(number + np.arange(d))
             a = angle_ * (number + 1) / 3 if moved else 0.0
             turn = np.eye(d)
             turn[:2, :2] = [[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]
             away = (number + 1) * np.arange(1.0, d + 1) if moved else np.zeros(d)
             pull = np.array([0.05 * np.sin(number), *(0.0,) * (d - 2), 0.1])
 
-            def place(x, own=pull, turn=turn, away=away, wave=0.02 * number):
-                bent = x[:d] + own[:, None] + wave * np.sin(3 * x[0])
+            def place(x, body_motion=pull, turn=turn, away=away, wave=0.02 * number):
+                bent = x[:d] + body_motion[:, None] + wave * np.sin(3 * x[0])
                 return turn @ bent + away[:, None] - x[:d]
 
             scene.u.interpolate(place)
-            shift.value[:] = turn @ (centre + own) + away - centre
+            shift.value[:] = turn @ (centre + body_motion) + away - centre
             angle.value = a
             contact.evaluate()
             if number == 2:
                 rows = gather(COMM, contact.points), gather(COMM, contact.traction @ turn)
-                found.append(sort_by_coordinates(*rows)[:, d:])
+                computed.append(sort_by_coordinates(*rows)[:, d:])
             contact.commit()
-    assert np.abs(found[0]).max() > 10.0
-    assert is_close(found[1], found[0], 1e-9)
+    assert np.abs(computed[0]).max() > 10.0
+    assert is_close(computed[1], computed[0], 1e-9)
 
 
 @pytest.mark.parametrize("law", [fc.Frictionless(1e4), fc.Coulomb(0.2, 1e4, 1e4)])
@@ -393,9 +397,9 @@ def test_small_and_finite_kinematics_agree_at_small_displacements(law):
     """
     t = np.linspace(0.2, np.pi - 0.2, 121)
     arc = np.column_stack([2 * np.cos(t), 2 * np.sin(t) - 1])[::-1]  # obstacle outside the arc
-    share, told = [], []
+    relative_errors, reported = [], []
     for size in (4e-3, 1e-3):
-        found = []
+        computed = []
         for kinematics, profile in (("finite", True), ("small", True), ("small", False)):
             scene = rubber("triangle", n=(12, 6), linear=True, bend=bend_top)
             shift = fem.Constant(scene.mesh, np.zeros(2))
@@ -412,10 +416,12 @@ def test_small_and_finite_kinematics_agree_at_small_displacements(law):
                 shift.value[:] = size * side, size * up
                 step = problem.solve()
                 problem.commit()
-            found.append(contact.resultants().force)
-            told.append(step.verdict.small_displacement_error["contact"].worst)
-        share.append(np.linalg.norm(found[0] - found[1]) / np.linalg.norm(found[1]))
-        assert is_close(found[1], found[2], 1e-5)
-        assert told[-3] == 0.0 and told[-2] == pytest.approx(told[-1], rel=1e-2)
-    assert share[0] > 1e-5
-    assert share[0] / share[1] == pytest.approx(4.0, rel=0.25)
+            computed.append(contact.resultants().force)
+            reported.append(step.verdict.small_displacement_error["contact"].worst)
+        relative_errors.append(
+            np.linalg.norm(computed[0] - computed[1]) / np.linalg.norm(computed[1])
+        )
+        assert is_close(computed[1], computed[2], 1e-5)
+        assert reported[-3] == 0.0 and reported[-2] == pytest.approx(reported[-1], rel=1e-2)
+    assert relative_errors[0] > 1e-5
+    assert relative_errors[0] / relative_errors[1] == pytest.approx(4.0, rel=0.25)

@@ -33,7 +33,7 @@ def block(low=0.0, bend=None, length=1.0, n=(8, 4)):
     return Bodies(boxes(axes, sides, bend=bend), E, 0.3)
 
 
-def fails(problem, *words):
+def assert_increment_refused(problem, *words):
     """Assert that the next increment fails on all ranks with these words."""
     assert_raised_on_all_ranks(problem.solve, fc.NotConverged, *words)
 
@@ -75,7 +75,7 @@ def test_tunnelling_through_a_thin_plate_is_refused(half, steps):
     contact = body.contact(BOTTOM, plate(half), fc.Frictionless(), kinematics="finite")
     problem = body.problem(contact)
     down.value = -1.5 / steps
-    fails(problem, "has crossed")
+    assert_increment_refused(problem, "has crossed")
     down.value = -0.4  # still above the plate
     assert problem.solve().verdict.failures == []
 
@@ -114,7 +114,7 @@ def test_plate_thinner_than_the_resolution_does_not_change_sides(law):
     problem.solve()
     problem.commit()
     up.value[1] = 0.012
-    fails(problem, "has crossed")
+    assert_increment_refused(problem, "has crossed")
     forces = []
     for up.value[1] in (0.004, 0.008, 0.012):
         problem.solve()
@@ -134,9 +134,9 @@ def test_tunnelling_is_refused_again_after_a_refused_increment(kinematics):
     contact = body.contact(BOTTOM, obstacle, fc.Frictionless(), kinematics=kinematics)
     problem = body.problem(contact)
     up.value[1] = 0.7
-    fails(problem, "has crossed")
+    assert_increment_refused(problem, "has crossed")
     up.value[1] = 0.6
-    fails(problem, "has crossed")
+    assert_increment_refused(problem, "has crossed")
     up.value[1] = 0.03
     problem.solve()
 
@@ -167,16 +167,16 @@ def ball_below(moved_by, kinematics, radius=0.2, gap=0.03):
     """Return problem, contact, displacement of the block, and constant that moves the ball."""
     body = block(n=(4, 2))
     shift, center = body.constant(np.zeros(2)), body.constant((0.3, -gap - radius))
-    lead = body.constant()
+    displacement = body.constant()
     body.prescribe(TOP, 0)
-    body.prescribe(TOP, 1, value=lead)
+    body.prescribe(TOP, 1, value=displacement)
     if moved_by == "distance":
         ball = fc.SignedDistance(lambda x: ufl.sqrt(ufl.dot(x - center, x - center)) - radius)
     else:
         ball = fc.Ball(center, radius, displacement=shift)
     contact = body.contact(BOTTOM, ball, fc.Frictionless(), kinematics=kinematics)
     moved = shift if moved_by == "displacement" else center
-    return body.problem(contact), contact, lead, moved.value
+    return body.problem(contact), contact, displacement, moved.value
 
 
 @KINEMATICS
@@ -191,7 +191,7 @@ def test_tunnelling_of_an_obstacle_moved_by_a_constant_is_refused(radius, moved_
     start = place.copy()
     for displacement in (0.47, 0.47, 1.2):
         place[:] = start[0], start[1] + displacement
-        fails(problem, "has crossed")
+        assert_increment_refused(problem, "has crossed")
     place[:] = start[0] + 0.3, start[1] + 0.02  # still below the block
     assert problem.solve().verdict.failures == []
 
@@ -200,15 +200,15 @@ def test_center_and_displacement_of_a_ball_give_the_same_force():
     """Pressed, moved sideways, and moved with the block: the forces agree to 1e-9."""
     forces = []
     for moved_by in ("displacement", "center"):
-        problem, contact, lead, place = ball_below(moved_by, "finite", gap=0.0)
-        found = []
+        problem, contact, body_displacement, place = ball_below(moved_by, "finite", gap=0.0)
+        computed = []
         for displacement in ((0.0, 0.01), (0.4, 0.0), (0.0, -0.5)):
             place[:] += displacement
-            lead.value = min(displacement[1], 0.0)
+            body_displacement.value = min(displacement[1], 0.0)
             problem.solve()
             problem.commit()
-            found.append(contact.resultants().normal_force)
-        forces.append(found)
+            computed.append(contact.resultants().normal_force)
+        forces.append(computed)
     assert forces[1] == pytest.approx(forces[0], rel=1e-9)
     assert min(forces[1]) > 0
 
@@ -229,26 +229,28 @@ def refuse_pin(center, radius, ups, kinematics):
 
 @pytest.mark.each
 @KINEMATICS
-@pytest.mark.parametrize("at", [0.07, 0.3, 0.55])
+@pytest.mark.parametrize("position", [0.07, 0.3, 0.55])
 @pytest.mark.parametrize("steps", [1, 2, 4])
-def test_pin_does_not_pass_between_checked_positions(steps, at, kinematics):
+def test_pin_does_not_pass_between_checked_positions(steps, position, kinematics):
     """A pin of radius 0.01 moves by 0.6 into facets of 0.25; no checked position ends in it."""
-    refuse_pin((at, -0.03), 0.01, np.linspace(0.0, 0.6, steps + 1)[1:], kinematics)
+    refuse_pin((position, -0.03), 0.01, np.linspace(0.0, 0.6, steps + 1)[1:], kinematics)
 
 
 @pytest.mark.each
 @KINEMATICS
-@pytest.mark.parametrize("at", [0.25, 0.3, 0.55])
+@pytest.mark.parametrize("position", [0.25, 0.3, 0.55])
 @pytest.mark.parametrize("far", [0.03, 0.4])
-def test_pin_thinner_than_the_allowed_penetration_does_not_pass(far, at, kinematics):
+def test_pin_thinner_than_the_allowed_penetration_does_not_pass(far, position, kinematics):
     """A pin of diameter 0.008 enters a facet of 0.25 by less than allowed, then moves farther."""
-    refuse_pin((at, -0.005), 0.004, [0.002, 0.004, 0.006, 0.008, 0.01, 0.012, far], kinematics)
+    refuse_pin(
+        (position, -0.005), 0.004, [0.002, 0.004, 0.006, 0.008, 0.01, 0.012, far], kinematics
+    )
 
 
 @KINEMATICS
-@pytest.mark.parametrize("at", [0.55, 0.6, 0.65])
+@pytest.mark.parametrize("position", [0.55, 0.6, 0.65])
 @pytest.mark.parametrize("steps", [1, 2, 7])
-def test_blade_does_not_penetrate_a_facet(steps, at, kinematics):
+def test_blade_does_not_penetrate_a_facet(steps, position, kinematics):
     """An upright blade, 0.02 thick, moves by 0.3 into facets of 0.25.
 
     The shortest path out of it is sideways, so that it may not resist points inside. No increment
@@ -260,7 +262,7 @@ def test_blade_does_not_penetrate_a_facet(steps, at, kinematics):
 
     def blade(x):
         along = ufl.max_value(-0.65, ufl.min_value(-0.05, x[1]))
-        return ufl.sqrt((x[0] - at) ** 2 + (x[1] - along) ** 2) - 0.01
+        return ufl.sqrt((x[0] - position) ** 2 + (x[1] - along) ** 2) - 0.01
 
     obstacle = fc.SignedDistance(blade, displacement=up)
     contact = body.contact(BOTTOM, obstacle, fc.Frictionless(), kinematics=kinematics)
@@ -277,8 +279,8 @@ def test_blade_does_not_penetrate_a_facet(steps, at, kinematics):
 
 @pytest.mark.each
 @KINEMATICS
-@pytest.mark.parametrize(("at", "aside"), [(0.3, 0.1), (0.35, -0.15), (0.7, -0.15)])
-def test_pin_that_also_moves_sideways_is_detected(kinematics, at, aside):
+@pytest.mark.parametrize(("position", "slide"), [(0.3, 0.1), (0.35, -0.15), (0.7, -0.15)])
+def test_pin_that_also_moves_sideways_is_detected(kinematics, position, slide):
     """A pin of radius 8 % of a facet moves in by 35 % and sideways, away from where it enters.
 
     It ends above Γc by more than the allowed 7 %, and no point resists.
@@ -288,14 +290,14 @@ def test_pin_that_also_moves_sideways_is_detected(kinematics, at, aside):
     body.prescribe(TOP, 0, 1)
     contact = body.contact(
         BOTTOM,
-        fc.Ball((at, -0.04), 0.04, displacement=move),
+        fc.Ball((position, -0.04), 0.04, displacement=move),
         fc.Frictionless(),
         kinematics=kinematics,
         quadrature=2,
     )
     problem = body.problem(contact)
-    move.value[:] = aside, 0.175
-    fails(problem, "has crossed")
+    move.value[:] = slide, 0.175
+    assert_increment_refused(problem, "has crossed")
 
 
 def capsule(center, half, radius):
@@ -360,7 +362,7 @@ def test_blade_does_not_pass_sideways_through_a_body(kinematics, sides):
     move.value[0] = -0.2
     assert problem.solve().verdict.failures == []
     move.value[0] = 1.6
-    fails(problem, "has crossed")
+    assert_increment_refused(problem, "has crossed")
 
 
 def test_bending_of_a_facet_is_not_tunnelling():
@@ -396,9 +398,9 @@ def test_rotation_of_a_blade_through_a_body_is_refused(steps):
     def blade(x):
         tip, grip = ufl.as_vector((1.5, -0.3)), ufl.as_vector((-1.0, -0.3))
         arm, along = x - grip, tip - grip
-        share = ufl.dot(arm, along) / ufl.dot(along, along)
-        share = ufl.conditional(share < 0, 0.0, ufl.conditional(share > 1, 1.0, share))
-        off = arm - share * along
+        fraction = ufl.dot(arm, along) / ufl.dot(along, along)
+        fraction = ufl.conditional(fraction < 0, 0.0, ufl.conditional(fraction > 1, 1.0, fraction))
+        off = arm - fraction * along
         return ufl.sqrt(ufl.dot(off, off)) - 0.01
 
     body = block()
@@ -435,7 +437,7 @@ def test_full_turn_of_a_blade_through_a_body_is_refused(length, angle):
     problem = body.problem(contact)
     turned.value = angle
     if length > 0.5:
-        fails(problem, "has crossed")
+        assert_increment_refused(problem, "has crossed")
     else:
         assert problem.solve().verdict.failures == []
         assert contact.resultants().normal_force == 0.0
@@ -460,13 +462,13 @@ def test_rotation_of_a_frictionless_ball_changes_no_force():
 
 @pytest.mark.each
 @KINEMATICS
-@pytest.mark.parametrize("at", [0.5, 0.53, 0.5625, 0.46])
-def test_ball_between_quadrature_points_is_detected(kinematics, at):
+@pytest.mark.parametrize("position", [0.5, 0.53, 0.5625, 0.46])
+def test_ball_between_quadrature_points_is_detected(kinematics, position):
     """A ball of a fifth of a facet is pressed in by more than its diameter, anywhere on a facet."""
     body = block()
     body.prescribe(TOP, 0, 1)
     up = body.constant(np.zeros(2))
-    ball = fc.Ball((at, -0.0125), 0.0125, displacement=up)
+    ball = fc.Ball((position, -0.0125), 0.0125, displacement=up)
     problem = body.problem(body.contact(BOTTOM, ball, fc.Frictionless(), kinematics=kinematics))
     up.value[1] = -0.01
     assert problem.solve().verdict.failures == []
@@ -544,7 +546,7 @@ def test_body_does_not_enter_another_one_sideways(kinematics, displacement):
     if displacement < 0.5:  # ends before the post
         assert problem.solve().verdict.failures == []
     else:
-        fails(problem, "crossed")
+        assert_increment_refused(problem, "crossed")
 
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
@@ -614,12 +616,12 @@ def test_end_face_of_a_slab_is_not_taken_for_penetration():
         body.prescribe(TOP, 0, value=along)
         contact = body.contact(BOTTOM, tags, fc.Coulomb(0.2), kinematics="finite")
         problem = body.problem(contact)
-        found = []
+        computed = []
         for along.value in (0.0, 0.48, 0.97):
             problem.solve()
             problem.commit()
-            found.append(contact.resultants().normal_force)
-        forces.append(found)
+            computed.append(contact.resultants().normal_force)
+        forces.append(computed)
     assert forces[1] == pytest.approx(forces[0], rel=1e-9)
 
 
@@ -645,7 +647,7 @@ def test_pin_next_to_closed_facets_is_detected(kinematics):
     problem = body.problem(
         body.contact(BOTTOM, FLOOR, fc.Frictionless(), kinematics=kinematics, quadrature=2)
     )
-    fails(problem, "penetrates", "1.2")
+    assert_increment_refused(problem, "penetrates", "1.2")
 
 
 @KINEMATICS
@@ -684,7 +686,7 @@ def test_crossing_ridges_are_detected(kinematics, both):
     assert problem.solve().verdict.failures == []
     problem.commit()
     down.value = -0.05
-    fails(problem, "penetrates")
+    assert_increment_refused(problem, "penetrates")
 
 
 def test_undeformed_vertex_at_a_singular_distance_is_accepted():
@@ -693,16 +695,16 @@ def test_undeformed_vertex_at_a_singular_distance_is_accepted():
     There the distance has no gradient. Reference: the force before the motion, to 1e-9.
     """
     body = block()
-    lead, shift = body.constant(), body.constant((0.0, -0.25))
+    displacement, shift = body.constant(), body.constant((0.0, -0.25))
     body.prescribe(TOP, 0)
-    body.prescribe(TOP, 1, value=lead)
+    body.prescribe(TOP, 1, value=displacement)
     ball = fc.SignedDistance(lambda x: ufl.sqrt(x[1] ** 2 + (x[0] - 0.5) ** 2) - 0.2, shift)
     surface = fc.ContactSurface(body.mesh, body.tags, BOTTOM, quadrature_scheme="vertex")
     contact = fc.Contact(body.u, surface, ball, fc.Frictionless(), kinematics="finite")
     problem = body.problem(contact)
     forces = []
     for up in (-0.25, 0.0):
-        lead.value, shift.value[1] = up + 0.19, up
+        displacement.value, shift.value[1] = up + 0.19, up
         problem.solve()
         problem.commit()
         forces.append(contact.resultants().normal_force)
@@ -738,7 +740,7 @@ def test_soft_contact_with_large_penetration_keeps_its_pairs(tags):
     problem.solve()
     problem.commit()
     down.value = -0.5
-    fails(problem, "penetrates")
+    assert_increment_refused(problem, "penetrates")
     for down.value in (-0.35, -0.5):
         problem.solve()
         problem.commit()
@@ -832,6 +834,6 @@ def test_penetration_of_nodes_off_quadrature_points_is_refused(cell, kinematics,
     problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact("vertex")])
     assert ("too soft" in caplog.text) == (mesh.comm.rank == 0)
     down.value, angle.value = -0.1, turned
-    fails(problem, "penetrates between the quadrature points")
+    assert_increment_refused(problem, "penetrates between the quadrature points")
     u.x.array[:] = 0.0
     assert fc.ContactProblem(F, u, bcs=bcs, contacts=[contact(None)]).solve().verdict.failures == []

@@ -24,11 +24,11 @@ def test_tension_of_the_fixed_end(tmp_path: Path) -> None:
     before the end: the last increments change nothing.
     """
     result = run_demo("capstan", tmp_path, *OPTIONS)
-    found = reference_values(result)
+    computed = reference_values(result)
     for t in (1.0, 0.5):
-        lacks = 1 - found[f"ln(T2/T1), t = {t:g}"] / (0.3 * math.pi)
-        assert t / 20 < lacks < 1.25 * t / 20
-    assert found["ln(T2/T1), t to 0"] == pytest.approx(0.3 * math.pi, rel=5e-3)
+        deficit = 1 - computed[f"ln(T2/T1), t = {t:g}"] / (0.3 * math.pi)
+        assert t / 20 < deficit < 1.25 * t / 20
+    assert computed["ln(T2/T1), t to 0"] == pytest.approx(0.3 * math.pi, rel=5e-3)
     for path in result["paths"]:
         turns, ratios = zip(*path, strict=True)
         assert turns[-1] == pytest.approx(3.01)

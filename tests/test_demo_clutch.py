@@ -22,14 +22,14 @@ def test_torque_of_full_slip(tmp_path: Path) -> None:
     slip is a part of it. Rotating the whole scene as well changes nothing, to 1e-7.
     """
     result = run_demo("clutch", tmp_path)
-    found, path = reference_values(result), result["path"]
+    computed, path = reference_values(result), result["path"]
     last = path[-1]
     assert last["angle"] == 90.0
     assert last["torque"] == pytest.approx(0.3 * last["force"] * 15.5556, rel=0.02)
     assert last["torque"] == pytest.approx(last["of all slipping"], rel=1e-6)
     assert last["torque"] == pytest.approx(last["held"], rel=1e-6)
     for name in ("force", "torque"):
-        assert found[f"{name}, rotating frame, relative change"] < 1e-7
+        assert computed[f"{name}, rotating frame, relative change"] < 1e-7
     # Stick, then stick and slip, then slip of all points; the torque grows until then.
     assert path[1]["slip"] == 0 and path[4]["stick"] and path[4]["slip"]
     assert all(row["stick"] == 0 for row in path[5:])

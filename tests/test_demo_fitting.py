@@ -22,19 +22,19 @@ def test_statics_and_homogeneity(tmp_path: Path) -> None:
     P = 0.02656 · 6.4 · 43 daN; the flank rises by 40 mm over 22 mm.
     """
     result = run_demo("fitting", tmp_path)
-    found = reference_values(result)
+    computed = reference_values(result)
     half = 0.02656 * 6.4 * 43 / 2
     length = math.hypot(22, 40)
     sine, cosine = 22 / length, 40 / length
-    assert found["vertical force on a flank [daN]"] == pytest.approx(half, rel=1e-7)
-    assert found["half of the top reaction [daN]"] == pytest.approx(half, rel=1e-7)
-    assert found["normal force, μ = 0 [daN]"] == pytest.approx(half / sine, rel=1e-7)
+    assert computed["vertical force on a flank [daN]"] == pytest.approx(half, rel=1e-7)
+    assert computed["half of the top reaction [daN]"] == pytest.approx(half, rel=1e-7)
+    assert computed["normal force, μ = 0 [daN]"] == pytest.approx(half / sine, rel=1e-7)
     normal, tangential = result["normal_force"], result["tangential_force"]
     assert half / (sine + 0.2 * cosine) * (1 - 1e-7) <= normal <= half / (sine - 0.2 * cosine)
     # The closed flank slips in one direction, so that the sum of |τ| is also the resultant.
     assert result["lateral_thrust"] == pytest.approx(normal * cosine - tangential * sine, rel=1e-7)
-    assert found["twice the load, relative difference"] <= 1e-8
-    assert found["5 increments, relative difference"] <= 1e-8
+    assert computed["twice the load, relative difference"] <= 1e-8
+    assert computed["5 increments, relative difference"] <= 1e-8
     for name in ("flank", "mesh"):
         assert (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 

@@ -24,11 +24,11 @@ def test_torque_over_axial_force(tmp_path: Path) -> None:
     contribution of friction by a thousandth.
     """
     result = run_demo("screw", tmp_path, "--friction", "0.2", "--cells", "3")
-    found = reference_values(result)
+    computed = reference_values(result)
     alpha, phi = np.arctan(0.3), np.arctan(0.2)
-    assert found["μ = 0: largest |M / (F P) - 1|"] < 1e-9
-    assert found["raising, M / (F R)"] == pytest.approx(np.tan(alpha + phi), abs=3e-4)
-    assert found["lowering, M / (F R)"] == pytest.approx(np.tan(alpha - phi), abs=3e-4)
+    assert computed["μ = 0: largest |M / (F P) - 1|"] < 1e-9
+    assert computed["raising, M / (F R)"] == pytest.approx(np.tan(alpha + phi), abs=3e-4)
+    assert computed["lowering, M / (F R)"] == pytest.approx(np.tan(alpha - phi), abs=3e-4)
     assert all(row["force"] > 0.5 for row in result["path"][1:])
     assert [result["path"][i]["stick"] for i in (13, -1)] == [0, 0]
     for name in ("screw.png", "pressure.png"):

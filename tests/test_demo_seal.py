@@ -22,12 +22,12 @@ def test_force_over_compression(tmp_path: Path) -> None:
     its outer wall, and increases the final force by about half (at least 30 %).
     """
     result = run_demo("seal", tmp_path)
-    found = reference_values(result)
+    computed = reference_values(result)
     for c, force in ((0.15, 2.196), (0.2, 3.450), (0.25, 5.054)):
-        assert found[f"force at c = {c:g} [N/mm]"] == pytest.approx(force, rel=0.05)
-    free, held = result["forces"]["between plates"], result["forces"]["in a groove"]
-    assert held[:2] == pytest.approx(free[:2], rel=1e-6)
-    assert held[-1] > 1.3 * free[-1]
+        assert computed[f"force at c = {c:g} [N/mm]"] == pytest.approx(force, rel=0.05)
+    free, in_groove = result["forces"]["between plates"], result["forces"]["in a groove"]
+    assert in_groove[:2] == pytest.approx(free[:2], rel=1e-6)
+    assert in_groove[-1] > 1.3 * free[-1]
     for name in ("seal.png", "section.png"):
         assert (tmp_path / name).read_bytes()[:4] == b"\x89PNG"
 

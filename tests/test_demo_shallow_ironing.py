@@ -34,6 +34,6 @@ def test_pressing_and_first_sliding(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_dragging_by_four_times_the_die(tmp_path: Path) -> None:
     """V(1.5) and H(1.5) are in the published ranges."""
-    found = reference_values(run_demo("shallow_ironing", tmp_path, "--until", "1.5"))
-    assert 337.0 < found["V, t = 1.5"] < 421.0
-    assert 102.0 < found["H, t = 1.5"] < 189.0
+    computed = reference_values(run_demo("shallow_ironing", tmp_path, "--until", "1.5"))
+    assert 337.0 < computed["V, t = 1.5"] < 421.0
+    assert 102.0 < computed["H, t = 1.5"] < 189.0

@@ -24,16 +24,16 @@ def test_insertion_release_and_extraction(tmp_path: Path) -> None:
     remains, to 2 % (the end of the pin outside of the hub is a fortieth of the joint).
     """
     result = run_demo("tapered_pin", tmp_path, "--cells", "20")
-    found = reference_values(result)
-    assert found["mean pressure, insertion [MPa]"] == pytest.approx(205.4, rel=5e-3)
-    assert found["dry, insertion force [N]"] == pytest.approx(82.6e3, rel=5e-3)
-    assert found["dry, extraction force [N]"] == pytest.approx(71.2e3, rel=5e-3)
-    assert found["dry, relative depth after release"] > 0.995
-    assert found["dry, prescribed force: relative depth after release"] > 0.995
-    assert found["lubricated: relative depth, 0.5 of the holding force"] == pytest.approx(
+    computed = reference_values(result)
+    assert computed["mean pressure, insertion [MPa]"] == pytest.approx(205.4, rel=5e-3)
+    assert computed["dry, insertion force [N]"] == pytest.approx(82.6e3, rel=5e-3)
+    assert computed["dry, extraction force [N]"] == pytest.approx(71.2e3, rel=5e-3)
+    assert computed["dry, relative depth after release"] > 0.995
+    assert computed["dry, prescribed force: relative depth after release"] > 0.995
+    assert computed["lubricated: relative depth, 0.5 of the holding force"] == pytest.approx(
         0.5, rel=0.02
     )
-    assert found["lubricated: relative depth after release"] == pytest.approx(0.0, abs=1e-6)
+    assert computed["lubricated: relative depth after release"] == pytest.approx(0.0, abs=1e-6)
     dry, _, oiled = result["paths"]
     # The dry force changes its sign at the reversal; the lubricated one never does.
     (turned,) = [i for i, (s, _, _) in enumerate(dry) if abs(s - 2.0) < 1e-9]

@@ -40,17 +40,17 @@ def test_solutions(symmetric):
     rng, fixed, matrix, ksp, operator = scene(symmetric)
     for fixed_now in (fixed, fixed + 0.5 * np.eye(N)):
         for n in (3, 4, 9, 20, N - 2, 5, 0, 12):
-            whole = fixed_now.copy()
+            full = fixed_now.copy()
             rows, columns = (a.ravel() for a in np.indices((n, n)))
             added = rng.normal(size=n * n) / N
-            whole[rows, columns] += added
+            full[rows, columns] += added
             operator.set_parts(fixed_now, rows, columns, added)
             matrix.assemble()  # marks it as changed
             right = rng.normal(size=N)
             b, x = (PETSc.Vec().createSeq(N) for _ in range(2))
             b.array[:] = right
             ksp.solve(b, x)
-            assert np.allclose(x.array, np.linalg.solve(whole, right), rtol=0, atol=1e-12)
+            assert np.allclose(x.array, np.linalg.solve(full, right), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("size", [1.0, 1e8])
@@ -61,10 +61,10 @@ def test_few_changes_update_the_factors(size, monkeypatch):
     stiff points spoil the update, the residual triggers one.
     """
     rng, fixed, matrix, ksp, operator = scene(True)
-    made = []
+    refactorisations = []
     solver = ksp.pc.getPythonContext()
-    anew = solver.refactor
-    monkeypatch.setattr(solver, "refactor", lambda: made.append(1) or anew())
+    refactor = solver.refactor
+    monkeypatch.setattr(solver, "refactor", lambda: refactorisations.append(1) or refactor())
     diagonal = np.arange(N)
     added = np.where(diagonal < 25, size, 0.0)
     counts = []
@@ -77,7 +77,7 @@ def test_few_changes_update_the_factors(size, monkeypatch):
         b.array[:] = right
         ksp.solve(b, x)
         assert np.allclose(x.array, np.linalg.solve(fixed + np.diag(added), right), 0, 1e-9)
-        counts.append(len(made))
+        counts.append(len(refactorisations))
     if size > 1.0:
         assert counts[2] > 1
     else:
@@ -93,23 +93,23 @@ def test_operator_products():
     x, y = (PETSc.Vec().createSeq(N) for _ in range(2))
     x.array[:] = rng.normal(size=N)
     matrix.mult(x, y)
-    whole = fixed.copy()
-    whole[[1, 1, 7], [2, 1, 0]] += values
-    assert np.allclose(y.array, whole @ x.array, rtol=0, atol=1e-13)
+    full = fixed.copy()
+    full[[1, 1, 7], [2, 1, 0]] += values
+    assert np.allclose(y.array, full @ x.array, rtol=0, atol=1e-13)
     matrix.multTranspose(x, y)
-    assert np.allclose(y.array, whole.T @ x.array, rtol=0, atol=1e-13)
+    assert np.allclose(y.array, full.T @ x.array, rtol=0, atol=1e-13)
 
 
 def test_zero_pivot_is_reported():
     """A zero pivot is reported once only, as a diverged solution, which SNES understands."""
     _, fixed, matrix, ksp, operator = scene(True)
-    every = np.indices((N, N)).reshape(2, -1)
-    operator.set_parts(fixed, *every, -fixed.ravel())
+    indices = np.indices((N, N)).reshape(2, -1)
+    operator.set_parts(fixed, *indices, -fixed.ravel())
     b, x = (PETSc.Vec().createSeq(N) for _ in range(2))
     b.array[:] = 1.0
     ksp.solve(b, x)
     assert ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED
-    operator.set_parts(fixed, *every, 0 * fixed.ravel())
+    operator.set_parts(fixed, *indices, 0 * fixed.ravel())
     matrix.assemble()
     ksp.solve(b, x)
     assert ksp.getConvergedReason() > 0

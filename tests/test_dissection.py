@@ -56,22 +56,24 @@ def test_dissection_agrees_with_dense_algebra(symmetric, shift, inner):
     n = len(K)
     stays = np.flatnonzero((places[:, 2] == 0) | (places[:, 0] == 4)).astype(np.int32)
     inside = np.setdiff1d(np.arange(n), stays)
-    made = Dissection(sparse(K), stays, places, symmetric=symmetric, inner=inner)
+    dissection = Dissection(sparse(K), stays, places, symmetric=symmetric, inner=inner)
     inverse = np.linalg.inv(K[np.ix_(inside, inside)])
     away = K[np.ix_(stays, inside)] @ inverse
     schur = K[np.ix_(stays, stays)] - away @ K[np.ix_(inside, stays)]
-    assert is_close(made.schur, schur, 1e-10)
-    assert made.release().shape == schur.shape and not made.schur.size
+    assert is_close(dissection.schur, schur, 1e-10)
+    assert dissection.release().shape == schur.shape and not dissection.schur.size
     rng = np.random.default_rng(6)
     force, boundary = np.zeros(n), rng.normal(size=stays.size)
     force[inside] = rng.normal(size=inside.size)
-    partial = made.eliminate(force)
+    partial = dissection.eliminate(force)
     assert is_close(partial.reduced_rhs[stays], -away @ force[inside], 1e-10)
-    for given, load in ((boundary, 0 * force), (0 * boundary, force), (boundary, force)):
+    for boundary_values, load in ((boundary, 0 * force), (0 * boundary, force), (boundary, force)):
         expected = np.zeros(n)
-        expected[stays] = given
-        expected[inside] = inverse @ (load[inside] - K[np.ix_(inside, stays)] @ given)
-        assert is_close(made.back_substitute(given, made.eliminate(load)), expected, 1e-10)
+        expected[stays] = boundary_values
+        expected[inside] = inverse @ (load[inside] - K[np.ix_(inside, stays)] @ boundary_values)
+        assert is_close(
+            dissection.back_substitute(boundary_values, dissection.eliminate(load)), expected, 1e-10
+        )
 
 
 def test_singular_block_is_refused():

@@ -20,7 +20,7 @@ RUN = ROOT / "docker" / "run"
 
 # Records its arguments.
 DOCKER = """#!/bin/sh
-echo "$@" >>"${0%/*}/asked"
+echo "$@" >>"${0%/*}/requests"
 [ "$1" != info ] || echo 99
 [ "$1" != image ] || [ -z "$IMAGES_MISSING" ]
 """
@@ -41,21 +41,21 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         monkeypatch.delenv(name, raising=False)
 
     def call(**environment: str) -> tuple[subprocess.CompletedProcess[str], list[str]]:
-        asked = tmp_path / "asked"
-        asked.write_text("")
+        requests = tmp_path / "requests"
+        requests.write_text("")
         command = [str(RUN), "echo", "here"]
         process = subprocess.run(
             command, env=os.environ | environment, capture_output=True, text=True, timeout=60
         )
-        return process, asked.read_text().splitlines()
+        return process, requests.read_text().splitlines()
 
     return call
 
 
 def test_command_runs_locally_if_dolfinx_is_installed(run) -> None:
     """Where DOLFINx is installed the command runs locally, without a request to the engine."""
-    process, asked = run()
-    assert (process.returncode, process.stdout, asked) == (0, "here\n", [])
+    process, requests = run()
+    assert (process.returncode, process.stdout, requests) == (0, "here\n", [])
 
 
 def test_more_ranks_than_cores_start_without_warnings() -> None:
@@ -71,12 +71,12 @@ def test_more_ranks_than_cores_start_without_warnings() -> None:
 @pytest.mark.whole
 @pytest.mark.parametrize("suite", ["Debian 13", "../unstable", "-x"])
 def test_bad_suite_is_refused(run, suite: str) -> None:
-    process, asked = run(FENICS_CONTACT_SUITE=suite)
-    assert process.returncode == 1 and asked == []
+    process, requests = run(FENICS_CONTACT_SUITE=suite)
+    assert process.returncode == 1 and requests == []
     assert f"FENICS_CONTACT_SUITE is '{suite}'; it must be a suite of Debian" in process.stderr
 
 
 def test_suite_together_with_an_image_is_refused(run) -> None:
-    process, asked = run(FENICS_CONTACT_SUITE="unstable", FENICS_CONTACT_BASE="debian:trixie")
-    assert process.returncode == 1 and asked == []
+    process, requests = run(FENICS_CONTACT_SUITE="unstable", FENICS_CONTACT_BASE="debian:trixie")
+    assert process.returncode == 1 and requests == []
     assert "both say what to start from: unset one" in process.stderr

@@ -37,12 +37,12 @@ BLOCK = re.compile(r"^```\{(\S+)\} ?([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOT
 
 def entries(page: Path) -> list[Path]:
     """Return the pages in a page's toctrees."""
-    found = []
+    names = []
     for kind, _, body in BLOCK.findall(page.read_text()):
         if kind == "toctree":
             lines = [line for line in body.splitlines() if line and not line.startswith(":")]
-            found += [re.sub(r".*<(.*)>", r"\1", line) for line in lines]
-    return [page.parent / f"{entry}.md" for entry in found]
+            names += [re.sub(r".*<(.*)>", r"\1", line) for line in lines]
+    return [page.parent / f"{entry}.md" for entry in names]
 
 
 def test_every_page_is_in_one_toctree() -> None:
@@ -99,13 +99,13 @@ def test_link_targets_exist() -> None:
     External addresses are checked by ``sphinx -b linkcheck`` on pages only, so that other files
     must not have addresses that are on no page.
     """
-    asked = {link for page in PAGES for link in links(page)}
+    targets = {link for page in PAGES for link in links(page)}
     dead = []
     for page, link in ((each, link) for each in [*OTHERS, *PAGES] for link in links(each)):
         path, _, anchor = link.partition("#")
         target = (page.parent / path) if path else page
         if link.startswith("https://"):
-            alive = link in asked
+            alive = link in targets
         else:
             alive = target.exists() and (not anchor or anchor in anchors(target))
         if not alive:
@@ -149,7 +149,7 @@ def test_every_picture_names_its_script() -> None:
             ), picture
 
 
-def documented() -> list[str]:
+def documented_names() -> list[str]:
     """Return the qualified names in the reference."""
     text = "".join(page.read_text() for page in PAGES if page.parent.name == "reference")
     return re.findall(r"^\.\. autoapi\w+:: (\S+)$", text, flags=re.MULTILINE)
@@ -157,35 +157,35 @@ def documented() -> list[str]:
 
 def test_every_public_name_is_in_the_reference() -> None:
     """Public names of the package, and ``__all__`` of its public modules, are in the reference."""
-    wanted = []
+    expected = []
     for public in set(fenics_contact.__all__) - {"__version__"}:
         value = getattr(fenics_contact, public)
         if isinstance(value, ModuleType):
-            wanted += [f"{value.__name__}.{each}" for each in value.__all__]
+            expected += [f"{value.__name__}.{each}" for each in value.__all__]
         else:
-            wanted.append(f"fenics_contact.{public}")
-    assert sorted(documented()) == sorted(wanted)
+            expected.append(f"fenics_contact.{public}")
+    assert sorted(documented_names()) == sorted(expected)
     assert "`fenics_contact.__version__`" in (DOCS / "reference" / "index.md").read_text()
 
 
 # ---- texts ---------------------------------------------------------------------------------------
 
 
-def raised() -> dict[tuple[str, int], str]:
+def raised_errors() -> dict[tuple[str, int], str]:
     """Return every ``raise`` of an error with arguments, by module and line."""
-    found = {}
+    errors = {}
     for path in messages.PACKAGE.rglob("*.py"):
         module = ".".join(path.relative_to(messages.PACKAGE).with_suffix("").parts)
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args:
-                found[module, node.lineno] = ast.unparse(node.exc)
-    return found
+                errors[module, node.lineno] = ast.unparse(node.exc)
+    return errors
 
 
 def test_every_error_is_listed() -> None:
     """Every ``raise`` with its own text is listed; the others pass on a text from elsewhere."""
-    told = {(m.module, m.line) for m in messages.read() if m.kind not in ("warning", "log")}
-    missing = [text for place, text in raised().items() if place not in told]
+    listed = {(m.module, m.line) for m in messages.read() if m.kind not in ("warning", "log")}
+    missing = [text for place, text in raised_errors().items() if place not in listed]
     assert sorted(missing) == [
         "NotConverged(number, reason, verdict, prefix=self._prefix)",
         "OSError(text)",
@@ -193,16 +193,16 @@ def test_every_error_is_listed() -> None:
         "ValueError(f'{name}: {error}')",
         "self._not_converged(state, reason, verdict, increment.attempts)",
     ]
-    assert len(told) > 200
+    assert len(listed) > 200
 
 
 def test_every_condition_is_listed() -> None:
     """Every module with conditions has verdict texts, the known ones included."""
     verdicts = [m for m in messages.read() if m.kind == "verdict"]
-    told, texts = {m.module for m in verdicts}, [m.text for m in verdicts]
+    listed, texts = {m.module for m in verdicts}, [m.text for m in verdicts]
     for path in (messages.PACKAGE / "checks").glob("*.py"):
         if "Condition(" in path.read_text() and path.stem != "condition":
-            assert f"checks.{path.stem}" in told
+            assert f"checks.{path.stem}" in listed
     for words in ("residual of", "is ejected", "cells are inverted", "friction supplies energy"):
         assert any(words in text for text in texts), words
     for words in ("has crossed the obstacle", "small-displacement assumption", "a distance"):
@@ -211,13 +211,13 @@ def test_every_condition_is_listed() -> None:
 
 def test_every_warning_is_listed() -> None:
     """Every module lists at least as many warnings as its source has calls that warn."""
-    told = Counter(m.module for m in messages.read() if m.kind == "warning")
+    listed = Counter(m.module for m in messages.read() if m.kind == "warning")
     for path in messages.PACKAGE.rglob("*.py"):
         module = ".".join(path.relative_to(messages.PACKAGE).with_suffix("").parts)
         calls = re.findall(r"\b(?:logger\.(?:warning|critical)|warn)\($", path.read_text(), re.M)
         calls += re.findall(r"\blogger\.warning\((?=\S)", path.read_text())
         passed_on = 2 if module == "parallel" else 0  # `parallel.warn` itself
-        assert told[module] >= len(calls) - passed_on, module
+        assert listed[module] >= len(calls) - passed_on, module
 
 
 def test_texts_are_assembled_from_the_source(tmp_path: Path) -> None:
@@ -234,8 +234,8 @@ def test_texts_are_assembled_from_the_source(tmp_path: Path) -> None:
         "    logger.warning('%d of %s', x, many)\n"
         "    raise TypeError('it ' + hint(x))\n"
     )
-    found = [(m.line, m.kind, m.text) for m in messages.read(package)]
-    assert found == [
+    texts = [(m.line, m.kind, m.text) for m in messages.read(package)]
+    assert texts == [
         (7, "ValueError", "… is large; remove it"),
         (7, "ValueError", "… is small; remove it"),
         (8, "warning", "… of …"),
@@ -247,9 +247,14 @@ def test_tables_contain_every_text(tmp_path: Path) -> None:
     """Every message is a row of a Markdown table in a file that the page includes."""
     messages.write(tmp_path)
     page = (DOCS / "messages.md").read_text()
-    made = {file.name: file.read_text() for file in tmp_path.iterdir()}
-    assert sorted(made) == sorted(re.findall(r"\{include\} _generated/(\S+)", page))
-    rows = [line for text in made.values() for line in text.splitlines() if line.startswith("| ")]
+    pages_by_name = {file.name: file.read_text() for file in tmp_path.iterdir()}
+    assert sorted(pages_by_name) == sorted(re.findall(r"\{include\} _generated/(\S+)", page))
+    rows = [
+        line
+        for text in pages_by_name.values()
+        for line in text.splitlines()
+        if line.startswith("| ")
+    ]
     plain = [re.sub(r"\\(.)", r"\1", row) for row in rows]
     for message in messages.read():
         assert any(row.startswith(f"| {message.text} |") for row in plain), message
@@ -305,8 +310,8 @@ def test_scripts_run(path: Path, tmp_path: Path) -> None:
             timeout=300,
         )
         assert done.returncode == 0, done.stdout + done.stderr
-    said = {_words(line) for line in done.stdout.splitlines()}
-    assert [line for line in _quoted(path) if _words(line) not in said] == []
+    printed = {_words(line) for line in done.stdout.splitlines()}
+    assert [line for line in _quoted(path) if _words(line) not in printed] == []
     if path.stem != "results":
         assert "assert " in path.read_text()
         return

@@ -20,16 +20,18 @@ BOTTOM, TOP = 1, 2
 pytestmark = [pytest.mark.two_ranks, pytest.mark.hexahedra]
 
 
-def ends(mesh, axis: int, high: float, low: float = 0.0):
+def end_tags(mesh, axis: int, high: float, low: float = 0.0):
     """Return tags BOTTOM and TOP at the coordinates ``low`` and ``high``. Collective."""
     fdim = mesh.topology.dim - 1
-    found = [
-        dolfinx.mesh.locate_entities_boundary(mesh, fdim, lambda x, at=at: np.isclose(x[axis], at))
-        for at in (low, high)
+    end_facets = [
+        dolfinx.mesh.locate_entities_boundary(
+            mesh, fdim, lambda x, value=value: np.isclose(x[axis], value)
+        )
+        for value in (low, high)
     ]
-    facets = np.concatenate(found)
+    facets = np.concatenate(end_facets)
     order = np.argsort(facets)
-    values = np.repeat(np.int32([BOTTOM, TOP]), [len(f) for f in found])
+    values = np.repeat(np.int32([BOTTOM, TOP]), [len(f) for f in end_facets])
     return dolfinx.mesh.meshtags(mesh, fdim, facets[order], values[order])
 
 
@@ -48,7 +50,7 @@ def column(kind: str, degree: int = 2, **options):
         mesh = dolfinx.mesh.create_box(
             MPI.COMM_WORLD, [np.zeros(3), np.array(size)], (2, 2, 2), CellType.tetrahedron
         )
-    tags = ends(mesh, d - 1, 3.0)
+    tags = end_tags(mesh, d - 1, 3.0)
     V = fem.functionspace(mesh, ("Lagrange", degree, (d,)))
     u, v = fem.Function(V), ufl.TestFunction(V)
     body = LinearElastic(u, E, NU, kind, **options)
@@ -126,7 +128,7 @@ def test_axisymmetric_ring_on_a_mandrel() -> None:
     mesh = dolfinx.mesh.create_rectangle(
         MPI.COMM_WORLD, [(10.0, 0.0), (20.0, 2.0)], (40, 4), CellType.quadrilateral
     )
-    tags = ends(mesh, 0, 20.0, low=10.0)
+    tags = end_tags(mesh, 0, 20.0, low=10.0)
     V = fem.functionspace(mesh, ("Lagrange", 2, (2,)))
     u, v = fem.Function(V), ufl.TestFunction(V)
     modulus = fem.Constant(mesh, E)
@@ -160,7 +162,7 @@ def test_uniform_pressure_under_axisymmetric_disc(inner: float) -> None:
     """
     corners = [(inner, 0.0), (inner + 2.0, 1.0)]
     mesh = dolfinx.mesh.create_rectangle(MPI.COMM_WORLD, corners, (4, 3))
-    tags = ends(mesh, 1, 1.0)
+    tags = end_tags(mesh, 1, 1.0)
     V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
     u, v = fem.Function(V), ufl.TestFunction(V)
     body = LinearElastic(u, fem.Constant(mesh, E), NU, "axisymmetric")
@@ -173,19 +175,19 @@ def test_uniform_pressure_under_axisymmetric_disc(inner: float) -> None:
         bcs = [fem.dirichletbc(dolfinx.default_scalar_type(0.0), dofs, V.sub(0))]
     floor = fc.HalfSpace((0, 0), (0, 1))
 
-    def pressed(enforcement: str, **rule: str) -> fc.Contact:
+    def solve_contact(enforcement: str, **rule: str) -> fc.Contact:
         surface = fc.ContactSurface(mesh, tags, BOTTOM, **rule)
-        made = fc.Contact(
+        disc_contact = fc.Contact(
             u, surface, floor, fc.Frictionless(), weight=body.weight, enforcement=enforcement
         )
-        fc.ContactProblem(F, u, bcs=bcs, contacts=[made]).solve()
-        return made
+        fc.ContactProblem(F, u, bcs=bcs, contacts=[disc_contact]).solve()
+        return disc_contact
 
-    points = pressed("augmented").gather()
+    points = solve_contact("augmented").gather()
     assert points["pressure"] == pytest.approx(np.full(len(points["pressure"]), PRESSURE), rel=1e-5)
     if not inner:
         with pytest.raises(ValueError, match="weight is 0 at a vertex"):
-            pressed("penalty", quadrature_scheme="vertex")
+            solve_contact("penalty", quadrature_scheme="vertex")
 
 
 def test_moduli_as_functions() -> None:
@@ -196,7 +198,7 @@ def test_moduli_as_functions() -> None:
     modulus = fem.Function(fem.functionspace(mesh, ("DG", 0)))
     modulus.interpolate(lambda x: np.where(x[1] < 1, E, 3 * E))
     body = LinearElastic(u, modulus, 0.0, "plane stress", thickness=fem.Constant(mesh, 2.0))
-    tags = ends(mesh, 1, 2.0)
+    tags = end_tags(mesh, 1, 2.0)
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
     F = body.residual(v) + body.weight * PRESSURE * v[1] * ds(TOP)
     corner = fem.locate_dofs_geometrical(
@@ -272,7 +274,7 @@ def test_neo_hookean_column_at_large_strain(kind, isochoric):
     cell = CellType.tetrahedron if d == 3 else CellType.triangle
     make = dolfinx.mesh.create_box if d == 3 else dolfinx.mesh.create_rectangle
     mesh = make(MPI.COMM_WORLD, [np.zeros(d), np.array(size)], [2] * d, cell)
-    tags = ends(mesh, d - 1, 3.0)
+    tags = end_tags(mesh, d - 1, 3.0)
     V = fem.functionspace(mesh, ("Lagrange", 2, (d,)))
     u, v = fem.Function(V), ufl.TestFunction(V)
     body = NeoHookean(u, E, NU, kind, isochoric=isochoric)
@@ -292,8 +294,8 @@ def test_neo_hookean_column_at_large_strain(kind, isochoric):
         u, surface, floor, fc.Frictionless(k_n), weight=body.weight, kinematics="finite"
     )
     problem = fc.ContactProblem(body.residual(v), u, bcs=bcs, contacts=[contact])
-    for share in (0.25, 0.5, 0.75, 1.0):
-        push.value = -share
+    for factor in (0.25, 0.5, 0.75, 1.0):
+        push.value = -factor
         step = problem.solve()
         problem.commit()
     assert abs(across) < 1e-9 * E

@@ -17,7 +17,7 @@ from scenes.histories import BlockOnBallHistory
 
 COMM = MPI.COMM_WORLD
 # Accepted effectivity of an estimate: estimated over true error.
-USEFUL = (0.3, 3.0)
+EFFECTIVITY_BOUNDS = (0.3, 3.0)
 
 
 def budget(scene, problem, **kwargs):
@@ -40,13 +40,13 @@ def test_enforcement_of_uniform_pressure(cell, degree, method):
     scene = block(cell, degree, n=2, up=-p)
     problem, _ = scene.problem(fc.Frictionless(k), scene.rollers(), method=method)
     problem.solve()
-    found = budget(scene, problem)
-    assert is_close(found.parts["enforcement"]["displacement"], p / k, 1e-8)
-    size = found.values
+    computed = budget(scene, problem)
+    assert is_close(computed.parts["enforcement"]["displacement"], p / k, 1e-8)
+    size = computed.values
     for part in ("enforcement", "discretisation", "kinematics", "solver"):
         for name in ("normal force", "peak pressure"):
-            assert abs(found.parts[part][name]) <= 1e-8 * size[name], (part, name)
-    assert abs(found.parts["discretisation"]["displacement"]) <= 1e-8 * size["displacement"]
+            assert abs(computed.parts[part][name]) <= 1e-8 * size[name], (part, name)
+    assert abs(computed.parts["discretisation"]["displacement"]) <= 1e-8 * size["displacement"]
     assert is_close(size["peak pressure"], p, 1e-8)
 
 
@@ -56,10 +56,10 @@ def test_enforcement(friction):
     soft, stiff = (press(friction=friction, k=k, n=16) for k in (1e4, 3e6))
     soft.run(steps=2)
     stiff.run(steps=2)
-    found, truth = budget(soft.scene, soft.problem), quantities(stiff.problem)
+    computed, truth = budget(soft.scene, soft.problem), quantities(stiff.problem)
     for name in ("normal force", "peak pressure"):
-        ratio = found.parts["enforcement"][name] / (found.values[name] - truth[name])
-        assert USEFUL[0] < ratio < USEFUL[1], (name, ratio)
+        ratio = computed.parts["enforcement"][name] / (computed.values[name] - truth[name])
+        assert EFFECTIVITY_BOUNDS[0] < ratio < EFFECTIVITY_BOUNDS[1], (name, ratio)
 
 
 @pytest.mark.parametrize(("cell", "degree", "n"), [("quadrilateral", 1, 12), ("triangle", 1, 8)])
@@ -68,39 +68,39 @@ def test_discretisation(cell, degree, n):
     coarse, fine = (press(cell=cell, degree=degree, n=i, friction=0.0) for i in (n, 4 * n))
     coarse.run()
     fine.run()
-    found, truth = budget(coarse.scene, coarse.problem), quantities(fine.problem)
+    computed, truth = budget(coarse.scene, coarse.problem), quantities(fine.problem)
     name = "normal force"
-    ratio = found.parts["discretisation"][name] / (found.values[name] - truth[name])
-    assert USEFUL[0] < ratio < USEFUL[1], ratio
+    ratio = computed.parts["discretisation"][name] / (computed.values[name] - truth[name])
+    assert EFFECTIVITY_BOUNDS[0] < ratio < EFFECTIVITY_BOUNDS[1], ratio
 
 
 def test_discretisation_of_sliding():
     """If all closed points slip, the error of friction is μ times that of the normal force."""
-    made = press(friction=0.3)
-    made.push[-1].value, made.push[0].value = -0.03, 0.2
-    made.problem.small_displacement_tolerance = np.inf  # it slides far over the ball
-    made.problem.solve()
-    assert made.contact.resultants().stick == 0
-    found = budget(made.scene, made.problem).parts["discretisation"]
-    assert found["normal force"] != 0
-    assert is_close(found["friction force"], 0.3 * found["normal force"], 1e-6)
+    setup = press(friction=0.3)
+    setup.push[-1].value, setup.push[0].value = -0.03, 0.2
+    setup.problem.small_displacement_tolerance = np.inf  # it slides far over the ball
+    setup.problem.solve()
+    assert setup.contact.resultants().stick == 0
+    computed = budget(setup.scene, setup.problem).parts["discretisation"]
+    assert computed["normal force"] != 0
+    assert is_close(computed["friction force"], 0.3 * computed["normal force"], 1e-6)
 
 
 def test_increment_error():
     """The reference is the friction force of 32 increments, in a growing contact."""
     ends = {}
     for steps in (1, 2, 4, 32):
-        made = press(n=16)
+        setup = press(n=16)
         options = {"steps": steps, "estimate": steps < 32}
-        end = list(fc.increments(made.problem, made.load, **options))
+        end = list(fc.increments(setup.problem, setup.load, **options))
         assert len(end) == (2 * steps if steps < 32 else steps)
         assert [s.increment_error is None for s in end[:2]] == [True, steps == 32]
-        ends[steps] = quantities(made.problem), end[-1].increment_error
+        ends[steps] = quantities(setup.problem), end[-1].increment_error
     truth, name = ends[32][0], "friction force"
     for steps in (1, 2, 4):
         values, error = ends[steps]
         ratio = error[name] / (values[name] - truth[name])
-        assert USEFUL[0] < ratio < USEFUL[1], (steps, ratio)
+        assert EFFECTIVITY_BOUNDS[0] < ratio < EFFECTIVITY_BOUNDS[1], (steps, ratio)
 
 
 @pytest.mark.parametrize("condensation", [None, False])
@@ -112,11 +112,11 @@ def test_solver_error(condensation):
     exact = press(friction=0.0, condensation=condensation)
     rough.run()
     exact.run()
-    found, truth = budget(rough.scene, rough.problem), quantities(exact.problem)
+    computed, truth = budget(rough.scene, rough.problem), quantities(exact.problem)
     name = "normal force"
-    error = found.values[name] - truth[name]
+    error = computed.values[name] - truth[name]
     assert abs(error) > 1e-7 * truth[name]
-    assert is_close(found.parts["solver"][name], error, 0.01)
+    assert is_close(computed.parts["solver"][name], error, 0.01)
 
 
 def test_estimate_changes_no_state():
@@ -124,32 +124,32 @@ def test_estimate_changes_no_state():
 
     Tolerance 1e-9: it uses the solver of the tangent, and the next increment starts from H₀ again.
     """
-    plain, asked = press(), press()
-    for made in (plain, asked):
-        made.load(0.5)
-        made.problem.solve()
-        before = made.scene.u.x.array.copy(), made.contact.history.function.x.array.copy()
-        if made is asked:
-            budget(made.scene, made.problem)
-            now = made.scene.u.x.array, made.contact.history.function.x.array
+    plain, estimated = press(), press()
+    for setup in (plain, estimated):
+        setup.load(0.5)
+        setup.problem.solve()
+        before = setup.scene.u.x.array.copy(), setup.contact.history.function.x.array.copy()
+        if setup is estimated:
+            budget(setup.scene, setup.problem)
+            now = setup.scene.u.x.array, setup.contact.history.function.x.array
             assert all(COMM.allgather(all(map(np.array_equal, before, now))))
-        made.problem.commit()
-        if made is asked:
-            again = budget(made.scene, made.problem)
-            assert set(again.parts) == {"enforcement", "discretisation", "kinematics", "solver"}
-        made.load(1.0)
-        made.problem.solve()
-    assert is_close(nodal_values(asked.scene.u), nodal_values(plain.scene.u), 1e-9)
+        setup.problem.commit()
+        if setup is estimated:
+            repeated = budget(setup.scene, setup.problem)
+            assert set(repeated.parts) == {"enforcement", "discretisation", "kinematics", "solver"}
+        setup.load(1.0)
+        setup.problem.solve()
+    assert is_close(nodal_values(estimated.scene.u), nodal_values(plain.scene.u), 1e-9)
 
 
 def test_estimate_is_the_same_before_and_after_commit():
     """The springs of the increment and those committed give the same error, to 1e-6."""
-    made = press()
-    made.load(1.0)
-    made.problem.solve()
-    before = budget(made.scene, made.problem)
-    made.problem.commit()
-    after = budget(made.scene, made.problem)
+    setup = press()
+    setup.load(1.0)
+    setup.problem.solve()
+    before = budget(setup.scene, setup.problem)
+    setup.problem.commit()
+    after = budget(setup.scene, setup.problem)
     for part in before.parts:
         for name, value in before.parts[part].items():
             assert is_close(after.parts[part][name], value, 1e-6, scale=abs(before.values[name]))
@@ -157,16 +157,16 @@ def test_estimate_is_the_same_before_and_after_commit():
 
 def test_table_of_the_budget():
     """The table has five lines, one for each part, and the dominant part; contacts have names."""
-    made = press(k=1e3)
-    step = made.run(estimate=True)[-1]
-    found = budget(made.scene, made.problem, increment_error=step.increment_error)
-    lines = str(found).splitlines()
-    assert [line.split()[0] for line in lines[1:6]] == list(found.parts)
-    assert found.dominant in lines[6]
-    total = found.total["normal force"]
-    squares = [found.relative(p)["normal force"] ** 2 for p in found.parts]
+    setup = press(k=1e3)
+    step = setup.run(estimate=True)[-1]
+    computed = budget(setup.scene, setup.problem, increment_error=step.increment_error)
+    lines = str(computed).splitlines()
+    assert [line.split()[0] for line in lines[1:6]] == list(computed.parts)
+    assert computed.dominant in lines[6]
+    total = computed.total["normal force"]
+    squares = [computed.relative(p)["normal force"] ** 2 for p in computed.parts]
     assert is_close(total, np.sqrt(sum(squares)), 1e-14)
-    assert "not estimated" in str(budget(made.scene, made.problem))
+    assert "not estimated" in str(budget(setup.scene, setup.problem))
 
     scene = block("quadrilateral", 1, n=4, up=-1.0)
     contacts = [scene.contact(fc.Frictionless(k_n=1e3), name=name) for name in ("one", "other")]
@@ -183,9 +183,9 @@ def test_few_facets_in_contact_are_reported(cell, n):
     scene = block(cell, 1, n=n, up=-1.0)
     problem, _ = scene.problem(fc.Frictionless(k_n=1e3), scene.rollers())
     problem.solve()
-    found = budget(scene, problem)
-    assert is_close(found.across, n, 1e-12)
-    assert ("unreliable with fewer" in str(found)) == (n < 5)
+    computed = budget(scene, problem)
+    assert is_close(computed.across, n, 1e-12)
+    assert ("unreliable with fewer" in str(computed)) == (n < 5)
 
 
 def test_foundation_stiffness_is_not_an_error():
@@ -198,7 +198,7 @@ def test_foundation_stiffness_is_not_an_error():
 
 def test_units_do_not_matter():
     """Relative errors in metres and pascals are those in mm and MPa, to 1e-8."""
-    found = []
+    computed = []
     for length, pressure in ((1.0, 1.0), (1e-3, 1e6)):
         scene = block("triangle", 2, n=3, size=[length] * 2, E=1e3 * pressure)
         law = fc.Coulomb(0.3, fc.RelativeStiffness(10.0), fc.RelativeStiffness(10.0))
@@ -210,22 +210,22 @@ def test_units_do_not_matter():
             law, bcs, contact={"obstacle": supporting_ball(2, length=length)}, method="newton"
         )
         problem.solve()
-        made = budget(scene, problem)
-        found.append([v for part in made.parts for v in made.relative(part).values()])
-    assert is_close(found[1], found[0], 1e-8, scale=1.0)
+        estimate = budget(scene, problem)
+        computed.append([v for part in estimate.parts for v in estimate.relative(part).values()])
+    assert is_close(computed[1], computed[0], 1e-8, scale=1.0)
 
 
 def test_shapes_are_checked():
     """Stress and strain of different shapes are refused, on all ranks."""
-    made = press(n=2)
-    made.run()
-    u = made.scene.u
+    setup = press(n=2)
+    setup.run()
+    u = setup.scene.u
     assert_raised_on_all_ranks(
-        lambda: fc.estimate_errors(made.problem, ufl.Identity(3), strain=ufl.sym(ufl.grad(u))),
+        lambda: fc.estimate_errors(setup.problem, ufl.Identity(3), strain=ufl.sym(ufl.grad(u))),
         ValueError,
         "shape",
     )
-    assert_raised_on_all_ranks(lambda: fc.estimate_errors(made.problem, u), ValueError, "shape")
+    assert_raised_on_all_ranks(lambda: fc.estimate_errors(setup.problem, u), ValueError, "shape")
 
 
 @pytest.mark.parametrize("bulk", ["linear", "nonlinear"])
@@ -235,15 +235,20 @@ def test_estimate_with_an_unconstrained_obstacle_is_refused(bulk):
     MUMPS' failure with the singular matrix once remained: the next solution ended in PETSc's error
     76. Reference: the same problem without an estimate, to 1e-8.
     """
-    asked, twin = (BlockOnBallHistory(obstacle="force", wall=True, bulk=bulk) for _ in range(2))
-    assert_raised_on_all_ranks(
-        lambda: budget(asked.scene, asked.problem), ValueError, "not constrained", "obstacle"
+    estimated, reference = (
+        BlockOnBallHistory(obstacle="force", wall=True, bulk=bulk) for _ in range(2)
     )
-    for made in (asked, twin):
-        made.load(1.0)
-        made.problem.solve()
-    assert is_close(nodal_values(asked.scene.u), nodal_values(twin.scene.u), 1e-8)
-    assert budget(asked.scene, asked.problem).values["floor: normal force"] > 0
+    assert_raised_on_all_ranks(
+        lambda: budget(estimated.scene, estimated.problem),
+        ValueError,
+        "not constrained",
+        "obstacle",
+    )
+    for setup in (estimated, reference):
+        setup.load(1.0)
+        setup.problem.solve()
+    assert is_close(nodal_values(estimated.scene.u), nodal_values(reference.scene.u), 1e-8)
+    assert budget(estimated.scene, estimated.problem).values["floor: normal force"] > 0
 
 
 def test_estimate_continues_from_a_checkpoint(tmp_path):
@@ -251,17 +256,19 @@ def test_estimate_continues_from_a_checkpoint(tmp_path):
 
     A restart without the estimate is refused.
     """
-    whole = press()
-    end = whole.run(steps=3, estimate=True)[-1].increment_error
+    uninterrupted = press()
+    end = uninterrupted.run(steps=3, estimate=True)[-1].increment_error
     path = shared_folder(tmp_path) / "state.npz"
-    broken, after = press(), press()
-    for step in fc.increments(broken.problem, broken.load, steps=3, estimate=True, checkpoint=path):
+    interrupted, after = press(), press()
+    for step in fc.increments(
+        interrupted.problem, interrupted.load, steps=3, estimate=True, checkpoint=path
+    ):
         if step.increment == 4:
             break
-    again = after.run(steps=3, estimate=True, checkpoint=path)[-1].increment_error
-    values = quantities(whole.problem)
+    resumed = after.run(steps=3, estimate=True, checkpoint=path)[-1].increment_error
+    values = quantities(uninterrupted.problem)
     for name, error in end.items():
-        assert is_close(again[name], error, 1e-7, scale=abs(values[name]))
+        assert is_close(resumed[name], error, 1e-7, scale=abs(values[name]))
     assert_raised_on_all_ranks(
         lambda: press().run(steps=3, checkpoint=path), ValueError, "estimate", "remove it"
     )
@@ -283,12 +290,12 @@ def test_multipliers_have_no_enforcement_error():
 
 def test_multigrid_gives_the_same_budget():
     """Budgets by V-cycles and by factors agree to 1e-6, as systems are solved to 1e-8."""
-    found = []
+    computed = []
     for kind in ("direct", "multigrid"):
-        made = press(cell="hexahedron", n=4, condensation=False, linear_solver=kind)
-        made.run()
-        found.append(budget(made.scene, made.problem))
-    direct, multigrid = found
+        setup = press(cell="hexahedron", n=4, condensation=False, linear_solver=kind)
+        setup.run()
+        computed.append(budget(setup.scene, setup.problem))
+    direct, multigrid = computed
     for part in ("enforcement", "discretisation"):
         for name, value in direct.relative(part).items():
             assert is_close(multigrid.relative(part)[name], value, 1e-6, scale=1.0)
@@ -310,15 +317,15 @@ def test_stresses_of_the_package(kind, bulk):
         cell = mesh.basix_cell()
         parts = [("P", cell, 1), ("P", cell, 2, (2,))]
         elements = [basix.ufl.element(*p[:3], shape=p[3] if len(p) > 3 else ()) for p in parts]
-        whole = fem.Function(fem.functionspace(mesh, basix.ufl.mixed_element(elements)))
-        (p, u), (q, v) = ufl.split(whole), ufl.TestFunctions(whole.function_space)
+        mixed_function = fem.Function(fem.functionspace(mesh, basix.ufl.mixed_element(elements)))
+        (p, u), (q, v) = ufl.split(mixed_function), ufl.TestFunctions(mixed_function.function_space)
         body = fc.elasticity.NeoHookean(u, 1000.0, 0.45, kind, pressure=p)
-        F, space = body.residual(v, q=q), whole.function_space.sub(1)
+        F, space = body.residual(v, q=q), mixed_function.function_space.sub(1)
     else:
-        whole = u = fem.Function(displacement_space(mesh, 2))
+        mixed_function = u = fem.Function(displacement_space(mesh, 2))
         v, space = ufl.TestFunction(u.function_space), u.function_space
-        made = fc.elasticity.LinearElastic if bulk == "linear" else fc.elasticity.NeoHookean
-        body = made(u, 1000.0, 0.3, kind)
+        body_class = fc.elasticity.LinearElastic if bulk == "linear" else fc.elasticity.NeoHookean
+        body = body_class(u, 1000.0, 0.3, kind)
         F = body.residual(v)
     weight = None if kind != "axisymmetric" else body.weight
     bcs = []
@@ -329,16 +336,16 @@ def test_stresses_of_the_package(kind, bulk):
     ball = fc.Ball((0.0, -2.0), 2.0)
     contact = fc.Contact(u, surface, ball, fc.Frictionless(1e4), weight=weight)
     problem = fc.ContactProblem(
-        F, whole, bcs=bcs, contacts=[contact], small_displacement_tolerance=np.inf
+        F, mixed_function, bcs=bcs, contacts=[contact], small_displacement_tolerance=np.inf
     )
     problem.solve()
     gradient = body.strain(u) if bulk == "linear" else ufl.sym(body.gradient(u))
-    found = fc.estimate_errors(problem, body.stress)
+    computed = fc.estimate_errors(problem, body.stress)
     expected = fc.estimate_errors(problem, body.stress, strain=gradient)
-    assert is_close(found.energy, expected.energy, 1e-8) and found.energy > 1e-3
+    assert is_close(computed.energy, expected.energy, 1e-8) and computed.energy > 1e-3
     for part, errors in expected.parts.items():
         for name, error in errors.items():
-            assert is_close(found.parts[part][name], error, 1e-8, scale=found.values[name])
+            assert is_close(computed.parts[part][name], error, 1e-8, scale=computed.values[name])
 
 
 def test_remedy_of_the_small_displacement_error():

@@ -93,7 +93,7 @@ def test_examples_do_not_import_submodules() -> None:
 def test_examples_print_the_references(path: Path, ranks: tuple[int, ...], tmp_path: Path) -> None:
     """The printed result equals its reference, on two ranks to 1e-5; no files are written."""
     pattern, tolerance = PRINTED[path.stem]
-    found = []
+    computed = []
     for number in ranks:
         printed = run(path, tmp_path, number)
         assert len(printed.splitlines()) <= 2, printed
@@ -101,6 +101,6 @@ def test_examples_print_the_references(path: Path, ranks: tuple[int, ...], tmp_p
         assert match is not None, printed
         value, reference = map(float, match.groups())
         assert value == pytest.approx(reference, rel=tolerance)
-        found.append(value)
-    assert found[-1] == pytest.approx(found[0], rel=1e-5)
+        computed.append(value)
+    assert computed[-1] == pytest.approx(computed[0], rel=1e-5)
     assert list(tmp_path.iterdir()) == []

@@ -50,11 +50,11 @@ def test_extents_agree_with_the_points(cell):
 
     The extents do not depend on the number of ranks, some of which may have no points of a state.
     """
-    made, d = BlockOnBall(cell=cell), dimension(cell)
-    made.problem.small_displacement_tolerance = np.inf
-    seen = set()
-    for step in solve_path(made, path=[(0.0, -0.01), *PATH]):
-        found, points = step.contacts["contact"], made.contact.gather()
+    setup, d = BlockOnBall(cell=cell), dimension(cell)
+    setup.problem.small_displacement_tolerance = np.inf
+    statuses = set()
+    for step in solve_path(setup, path=[(0.0, -0.01), *PATH]):
+        computed, points = step.contacts["contact"], setup.contact.gather()
         if step.increment < len(PATH) + 1:
             continue  # the points are those of the last step
         closed = points["status"] != fc.Status.OPEN
@@ -64,22 +64,22 @@ def test_extents_agree_with_the_points(cell):
             "slip": points["status"] == fc.Status.SLIP,
         }
         for name, mask in states.items():
-            extent = found.extents[name]
+            extent = computed.extents[name]
             assert is_close([extent.area], [points["measure"] @ mask], 1e-12, scale=1.0)
             if mask.any():
-                seen.add(name)
+                statuses.add(name)
                 assert np.array_equal(extent.low, points["x"][mask].min(axis=0))
                 assert np.array_equal(extent.high, points["x"][mask].max(axis=0))
             else:
                 assert np.isnan(extent.low).all() and extent.low.shape == (d,)
-        assert found.area == found.extents["contact"].area
-    assert "contact" in seen
+        assert computed.area == computed.extents["contact"].area
+    assert "contact" in statuses
 
 
 def test_moment_of_a_step_is_about_the_origin():
     """The moment of a step is that of `Contact.moment` about the origin, on any number of ranks."""
-    made = BlockOnBall()
-    made.problem.small_displacement_tolerance = np.inf
-    *_, step = fc.increments(made.problem, made.load, 0, 1.5, steps=3)
-    assert is_close(step.contacts["contact"].moment, made.contact.moment([0, 0]), 1e-12)
+    setup = BlockOnBall()
+    setup.problem.small_displacement_tolerance = np.inf
+    *_, step = fc.increments(setup.problem, setup.load, 0, 1.5, steps=3)
+    assert is_close(step.contacts["contact"].moment, setup.contact.moment([0, 0]), 1e-12)
     assert MPI.COMM_WORLD.allreduce(abs(float(step.contacts["contact"].moment[0]))) > 0

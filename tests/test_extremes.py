@@ -161,8 +161,8 @@ def test_extreme_parameters_with_finite_kinematics(trial):
 def test_selected_trials_exist():
     """Every selected name is the name of a trial."""
     assert len(FAST) == sum(len(cases) for cases in CHOSEN.values())
-    wanted = [cases for chosen in (FINITE, BODIES) for cases in chosen.values()]
-    assert len({(t.group, t.case) for t in LARGE}) == sum(map(len, wanted))
+    selected_cases = [cases for chosen in (FINITE, BODIES) for cases in chosen.values()]
+    assert len({(t.group, t.case) for t in LARGE}) == sum(map(len, selected_cases))
 
 
 @pytest.mark.mpi

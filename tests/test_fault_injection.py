@@ -47,7 +47,7 @@ class Fault(Exception):
     """An error that nothing in the package raises."""
 
 
-def failing(function, after, error=Fault, *, rank=None):
+def raise_after(function, after, error=Fault, *, rank=None):
     """Return the function such that it raises after ``after`` calls, on all ranks or on one."""
     calls = [0]
 
@@ -60,13 +60,13 @@ def failing(function, after, error=Fault, *, rank=None):
     return call
 
 
-def assert_state_unchanged(made, call, kind, *words):
+def assert_state_unchanged(setup, call, kind, *words):
     """Check that the call raises on all ranks and leaves the state of the problem unchanged."""
-    before, increment = copy_state(made), made.problem.increment
+    before, increment = copy_state(setup), setup.problem.increment
     assert_raised_on_all_ranks(call, kind, *words)
-    assert are_identical(copy_state(made), before)
-    assert made.problem.increment == increment
-    assert made.contact.inputs.stiffness_factor.value == 1.0
+    assert are_identical(copy_state(setup), before)
+    assert setup.problem.increment == increment
+    assert setup.contact.inputs.stiffness_factor.value == 1.0
 
 
 def expected_error_types(error):
@@ -74,19 +74,19 @@ def expected_error_types(error):
     return error if COMM.rank == 0 else (error, RuntimeError)
 
 
-def assert_solves_like_reference(made, reference):
+def assert_solves_like_reference(setup, reference):
     """Solve the increment, and compare u with that of the problem without faults, to 1e-8."""
-    for m in (made, reference):
+    for m in (setup, reference):
         solve_path(m, path=PATH[2:3])
-    assert is_close(nodal_values(made.scene.u), nodal_values(reference.scene.u), 1e-8)
+    assert is_close(nodal_values(setup.scene.u), nodal_values(reference.scene.u), 1e-8)
 
 
 def pair(method="lbfgs", **kwargs):
     """Return two problems after two increments, with the load of the third."""
     both = [BlockOnBall(method=method, **kwargs) for _ in range(2)]
-    for made in both:
-        solve_path(made, path=PATH[:2])
-        made.set_top_displacement(*PATH[2])
+    for setup in both:
+        solve_path(setup, path=PATH[:2])
+        setup.set_top_displacement(*PATH[2])
     return both
 
 
@@ -98,50 +98,52 @@ def pair(method="lbfgs", **kwargs):
 @pytest.mark.parametrize("method", METHODS)
 def test_exception_in_a_callback_is_raised_unchanged(method, condensation, monkeypatch):
     """An exception in the residual or, if SNES evaluates it, the tangent is raised unchanged."""
-    made, reference = pair(method, condensation=condensation)
-    equations = made.problem.solver.equations
+    setup, reference = pair(method, condensation=condensation)
+    equations = setup.problem.solver.equations
     names = {"newton": "assemble_tangent", "continuation": "assemble_tangent"}
     for name in filter(None, ("residual", names.get(method))):
         for after in (1, 3) if name == "residual" else (0,):
             with monkeypatch.context() as patch:
-                patch.setattr(equations, name, failing(getattr(equations, name), after))
-                assert_state_unchanged(made, made.problem.solve, Fault, "on purpose")
-    assert_solves_like_reference(made, reference)
+                patch.setattr(equations, name, raise_after(getattr(equations, name), after))
+                assert_state_unchanged(setup, setup.problem.solve, Fault, "on purpose")
+    assert_solves_like_reference(setup, reference)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_exception_on_one_rank_is_raised_on_all(method, monkeypatch):
     """A MemoryError in the assembly on one rank is raised there; the other ranks get its text."""
-    made, reference = pair(method)
+    setup, reference = pair(method)
     for after in (0, 4):
         with monkeypatch.context() as patch:
-            broken = failing(fem.assemble_vector, after, MemoryError, rank=LAST)
-            patch.setattr(surface.fem, "assemble_vector", broken)
+            failing_call = raise_after(fem.assemble_vector, after, MemoryError, rank=LAST)
+            patch.setattr(surface.fem, "assemble_vector", failing_call)
             assert_state_unchanged(
-                made, made.problem.solve, (MemoryError, RuntimeError), "on purpose"
+                setup, setup.problem.solve, (MemoryError, RuntimeError), "on purpose"
             )
-    assert_solves_like_reference(made, reference)
+    assert_solves_like_reference(setup, reference)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_stopped_snes_restores_the_last_commit(method, monkeypatch):
     """SNES is stopped by an iteration limit of 0 or 1, and by KeyboardInterrupt in its test."""
-    made, reference = pair(method)
-    limit = made.problem.solver.main.max_it
+    setup, reference = pair(method)
+    limit = setup.problem.solver.main.max_it
     for allowed in (0, 1):
-        made.problem.solver.main.max_it = allowed
-        assert_state_unchanged(made, made.problem.solve, fc.NotConverged, "iteration limit reached")
-    made.problem.solver.main.max_it = limit
-    equations = made.problem.solver.equations
+        setup.problem.solver.main.max_it = allowed
+        assert_state_unchanged(
+            setup, setup.problem.solve, fc.NotConverged, "iteration limit reached"
+        )
+    setup.problem.solver.main.max_it = limit
+    equations = setup.problem.solver.equations
     monkeypatch.setattr(
-        equations, "is_converged", failing(equations.is_converged, 1, KeyboardInterrupt)
+        equations, "is_converged", raise_after(equations.is_converged, 1, KeyboardInterrupt)
     )
-    before = copy_state(made)
+    before = copy_state(setup)
     with pytest.raises(KeyboardInterrupt):
-        made.problem.solve()
-    assert are_identical(copy_state(made), before)
+        setup.problem.solve()
+    assert are_identical(copy_state(setup), before)
     monkeypatch.undo()
-    assert_solves_like_reference(made, reference)
+    assert_solves_like_reference(setup, reference)
 
 
 @pytest.mark.each
@@ -159,19 +161,19 @@ def test_exception_in_a_dense_solve_is_raised_unchanged(kind, name, method, erro
 
     The dense matrix is on the first rank; the other ranks get the text of the error.
     """
-    made, reference = pair(method)
+    setup, reference = pair(method)
     for after in (0, 1, 2, 5):
         with monkeypatch.context() as patch:
-            broken = failing(getattr(kind, name), after, error)
-            patch.setattr(kind, name, broken)
-            before = copy_state(made)
+            failing_call = raise_after(getattr(kind, name), after, error)
+            patch.setattr(kind, name, failing_call)
+            before = copy_state(setup)
             try:
-                made.problem.solve()
+                setup.problem.solve()
             except expected_error_types(error):
-                assert are_identical(copy_state(made), before)
+                assert are_identical(copy_state(setup), before)
             else:  # there were fewer calls
-                made.problem.restore()
-    assert_solves_like_reference(made, reference)
+                setup.problem.restore()
+    assert_solves_like_reference(setup, reference)
 
 
 @contextmanager
@@ -211,36 +213,36 @@ def test_an_interrupt_at_any_time(method, condensation):
 
     Interrupts are sent by the count of calls: a solve may take less than the tick of a timer.
     """
-    made, reference = pair(method, condensation=condensation)
-    made.problem.solve()  # compiles
-    made.problem.restore()
+    setup, reference = pair(method, condensation=condensation)
+    setup.problem.solve()  # compiles
+    setup.problem.restore()
     with interrupted_at(0) as events:
-        made.problem.solve()
-    solved = copy_state(made)[0]
-    made.problem.restore()
-    before, handler = copy_state(made), signal.getsignal(signal.SIGINT)
-    for share in np.linspace(0.01, 0.99, 50):
-        with pytest.raises(KeyboardInterrupt), interrupted_at(int(share * events[0])):
-            made.problem.solve()
-        if is_close(copy_state(made)[0], solved, 1e-8):  # the solve was complete
-            made.problem.restore()
-        assert are_identical(copy_state(made), before)
+        setup.problem.solve()
+    solved = copy_state(setup)[0]
+    setup.problem.restore()
+    before, handler = copy_state(setup), signal.getsignal(signal.SIGINT)
+    for fraction in np.linspace(0.01, 0.99, 50):
+        with pytest.raises(KeyboardInterrupt), interrupted_at(int(fraction * events[0])):
+            setup.problem.solve()
+        if is_close(copy_state(setup)[0], solved, 1e-8):  # the solve was complete
+            setup.problem.restore()
+        assert are_identical(copy_state(setup), before)
         assert signal.getsignal(signal.SIGINT) is handler
-    assert_solves_like_reference(made, reference)
+    assert_solves_like_reference(setup, reference)
 
 
 @pytest.mark.parametrize("name", ["product", "_solve"])
 def test_exception_in_a_linearised_solve_is_raised_unchanged(name, monkeypatch):
     """An exception in a product or solve of the error estimate is raised; later solves succeed."""
-    made, reference = pair("newton")
-    made.problem.solve()
+    setup, reference = pair("newton")
+    setup.problem.solve()
     kind = dense.SumOperator if name == "product" else dense.UpdatedLU
     with monkeypatch.context() as patch:
-        patch.setattr(kind, name, failing(getattr(kind, name), 0))
+        patch.setattr(kind, name, raise_after(getattr(kind, name), 0))
         with pytest.raises(expected_error_types(Fault), match="on purpose"):
-            fc.estimate_errors(made.problem, stress(made.scene.u, made.scene.E, made.scene.nu))
-    made.problem.restore()
-    assert_solves_like_reference(made, reference)
+            fc.estimate_errors(setup.problem, stress(setup.scene.u, setup.scene.E, setup.scene.nu))
+    setup.problem.restore()
+    assert_solves_like_reference(setup, reference)
 
 
 @pytest.mark.parametrize(
@@ -253,28 +255,28 @@ def test_exception_in_a_linearised_solve_is_raised_unchanged(name, monkeypatch):
 )
 def test_mumps_out_of_memory_raises_memory_error(method, condensation, prefix):
     """MUMPS with a limit of 1 MB, too little for this mesh, gives MemoryError, not a solution."""
-    made = BlockOnBall(mesh={"n": 64}, method=method, condensation=condensation)
-    made.set_top_displacement(*PATH[0])
+    setup = BlockOnBall(mesh={"n": 64}, method=method, condensation=condensation)
+    setup.set_top_displacement(*PATH[0])
     options, key = PETSc.Options(), f"{prefix}mat_mumps_icntl_23"
     options[key] = 1
     try:
-        assert_state_unchanged(made, made.problem.solve, MemoryError, "out of memory")
+        assert_state_unchanged(setup, setup.problem.solve, MemoryError, "out of memory")
     finally:
         del options[key]
-    assert made.problem.solve().verdict.failures == []
+    assert setup.problem.solve().verdict.failures == []
 
 
 ALONE = """
 from scenes.block_on_ball import PATH, BlockOnBall
 from fenics_contact import parallel
 parallel.ABORT_TIMEOUT = 0.2
-made = BlockOnBall()
-made.set_top_displacement(*PATH[0])
-name, rank = "{name}", made.problem.u.function_space.mesh.comm.rank
-equations = made.problem.solver.equations
+setup = BlockOnBall()
+setup.set_top_displacement(*PATH[0])
+name, rank = "{name}", setup.problem.u.function_space.mesh.comm.rank
+equations = setup.problem.solver.equations
 kept = getattr(equations, name)
 setattr(equations, name, lambda *args: kept(*args) if rank == 0 else 1 / 0)
-made.problem.solve()
+setup.problem.solve()
 """
 
 
@@ -284,28 +286,28 @@ def test_error_on_one_rank_without_communication_aborts_all(name):
     """If the other ranks wait for a failed one, all are aborted, and the error is printed."""
     words = command(2, "-c", ALONE.format(name=name))
     done = subprocess.run(words, env=subprocess_environment(), capture_output=True, timeout=60)
-    said = done.stderr.decode(errors="replace")
+    output = done.stderr.decode(errors="replace")
     assert done.returncode != 0
-    assert "rank 1 failed while the others were waiting" in said and "ZeroDivisionError" in said
+    assert "rank 1 failed while the others were waiting" in output and "ZeroDivisionError" in output
 
 
 def test_error_in_a_load_function_on_one_rank_is_raised_on_all():
     """The user's load function raises on one rank: all ranks raise, and the load is restored."""
-    made = BlockOnBall()
+    setup = BlockOnBall()
 
     def load(t):
         if t == 2.0 and COMM.rank == LAST:
             raise ValueError("no such load")
-        made.set_top_displacement(0.0, 0.01 * t)
+        setup.set_top_displacement(0.0, 0.01 * t)
 
     done = []
 
     def run():
-        done.extend(s.load for s in fc.increments(made.problem, load, 0.0, 2.0, steps=2))
+        done.extend(s.load for s in fc.increments(setup.problem, load, 0.0, 2.0, steps=2))
 
     assert_raised_on_all_ranks(run, ValueError, "no such load")
-    assert done == [1.0] and made.problem.increment == 1
-    assert made.push[-1].value == -0.01
+    assert done == [1.0] and setup.problem.increment == 1
+    assert setup.push[-1].value == -0.01
 
 
 # ---- in a commit ---------------------------------------------------------------------------------
@@ -313,22 +315,22 @@ def test_error_in_a_load_function_on_one_rank_is_raised_on_all():
 
 def test_failed_commit_restores_the_history():
     """An error after the history was written in `commit` restores the state before the solve."""
-    made, reference = pair()
-    problem = made.problem
-    before = copy_state(made)
+    setup, reference = pair()
+    problem = setup.problem
+    before = copy_state(setup)
     problem.solve()
-    update = made.contact.history.packed
+    update = setup.contact.history.packed
 
-    def broken(values):
+    def fail(values):
         update(values)  # already written when it fails
         raise Fault("put in on purpose")
 
-    made.contact.history.packed = broken
+    setup.contact.history.packed = fail
     assert_raised_on_all_ranks(problem.commit, Fault, "on purpose")
-    made.contact.history.packed = update
-    assert are_identical(copy_state(made), before)
+    setup.contact.history.packed = update
+    assert are_identical(copy_state(setup), before)
     assert problem.increment == 2
-    assert_solves_like_reference(made, reference)
+    assert_solves_like_reference(setup, reference)
 
 
 # ---- a full disk ---------------------------------------------------------------------------------
@@ -347,9 +349,9 @@ def full_disk(size: int):
 
 def files(folder: Path) -> dict[str, bytes]:
     COMM.barrier()
-    found = {name: (folder / name).read_bytes() for name in sorted(os.listdir(folder))}
+    contents = {name: (folder / name).read_bytes() for name in sorted(os.listdir(folder))}
     COMM.barrier()
-    return found
+    return contents
 
 
 @pytest.mark.each
@@ -358,13 +360,13 @@ def files(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("first", [True, False])
 def test_full_disk_leaves_files_unchanged(kind, first, tmp_path):
     """A file that could not be written is absent or unchanged; the next one is complete."""
-    made = BlockOnBall()
-    solve_path(made, path=PATH[:2])
-    points = made.contact.gather()
+    setup = BlockOnBall()
+    solve_path(setup, path=PATH[:2])
+    points = setup.contact.gather()
     write = {
-        "checkpoint": lambda: fc.checkpoint.save(made.problem, tmp_path / "state.npz"),
+        "checkpoint": lambda: fc.checkpoint.save(setup.problem, tmp_path / "state.npz"),
         "json": lambda: output.write_json(tmp_path / "r.json", {"x": [1.5] * 1000}, COMM),
-        "series": lambda: fc.Writer(tmp_path, made.problem).write(1),
+        "series": lambda: fc.Writer(tmp_path, setup.problem).write(1),
         "picture": lambda: plotting.plot_tractions(tmp_path / "p.png", points),
     }[kind]
     if kind == "picture":
@@ -372,12 +374,12 @@ def test_full_disk_leaves_files_unchanged(kind, first, tmp_path):
         os.remove(tmp_path / "p.png")
     if not first:
         write()
-    before, state = files(tmp_path), copy_state(made)
+    before, state = files(tmp_path), copy_state(setup)
     for size in (0, 500):
         with full_disk(size), pytest.raises((OSError, RuntimeError)):
             write()
         assert files(tmp_path) == before
-        assert are_identical(copy_state(made), state)
+        assert are_identical(copy_state(setup), state)
     write()
     after = files(tmp_path)
     assert after and set(before) <= set(after)
@@ -389,13 +391,13 @@ def test_full_disk_leaves_files_unchanged(kind, first, tmp_path):
 def test_failed_writing_leaves_no_files(kind, tmp_path, monkeypatch):
     """All ranks raise if a file cannot be renamed to its final name, and no part of it is left."""
     folder = shared_folder(tmp_path)
-    made = BlockOnBall()
+    setup = BlockOnBall()
     write = {
         "json": lambda: output.write_json(folder / "r.json", {"x": 1}, COMM),
-        "series": lambda: fc.Writer(folder, made.problem).write(1),
+        "series": lambda: fc.Writer(folder, setup.problem).write(1),
     }[kind]
     with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", failing(os.replace, 0, OSError))
+        patch.setattr(os, "replace", raise_after(os.replace, 0, OSError))
         assert_raised_on_all_ranks(write, (OSError, RuntimeError), "on purpose")
     assert files(folder) == {}
     write()

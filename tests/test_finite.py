@@ -83,18 +83,18 @@ def derivative_error(contact, scene, seed, step=1e-6):
     direction.interpolate(rough_field(scene.dim, seed))
     start = u.x.array.copy()
 
-    def force(share):
-        u.x.array[:] = start + share * step * direction.x.array
+    def force(factor):
+        u.x.array[:] = start + factor * step * direction.x.array
         return forces(operator).array_r.copy()
 
     difference = (force(1) - force(-1)) / (2 * step)
     u.x.array[:] = start
     tangent = operator.tangent()
-    found = tangent.createVecLeft()
-    tangent.mult(direction.x.petsc_vec, found)
+    computed = tangent.createVecLeft()
+    tangent.mult(direction.x.petsc_vec, computed)
     comm = scene.mesh.comm
     size = global_max(comm, np.abs(difference))
-    return global_max(comm, np.abs(found.array_r - difference)) / size, size
+    return global_max(comm, np.abs(computed.array_r - difference)) / size, size
 
 
 def forces(operator):
@@ -123,7 +123,7 @@ def test_tangent_agrees_with_finite_differences(cell, shape):
     Tolerance 1e-6 of the largest entry; differences with a step of 1e-6 have an error of 1e-9 if no
     status changes.
     """
-    seen = np.zeros(3)
+    n_by_status = np.zeros(3)
     laws = LAWS if cell in ("triangle", "quadrilateral") else LAWS | IN_SPACE
     for law in laws.values():
         scene = rubber(cell, 2 if cell == "triangle" else 1, n=(4, 2), shuffled=True)
@@ -134,8 +134,8 @@ def test_tangent_agrees_with_finite_differences(cell, shape):
             assert size > 1.0 and error < 1e-6
             contact.evaluate()
             r = contact.resultants()
-            seen += [r.open, r.stick, r.slip]
-    assert np.all(seen > 0)
+            n_by_status += [r.open, r.stick, r.slip]
+    assert np.all(n_by_status > 0)
 
 
 @pytest.mark.each
@@ -168,13 +168,13 @@ def test_boundary_form_agrees_with_the_operator(cell, shape, enforcement):
         size = global_max(comm, np.abs(vector.array_r))
         assert size > 0
         assert global_max(comm, np.abs(assembled.array[:n] - vector.array_r)) < 1e-11 * size
-        mine, theirs = operator.tangent(), fem.petsc.assemble_matrix(tangent)
-        theirs.assemble()
+        from_operator, from_form = operator.tangent(), fem.petsc.assemble_matrix(tangent)
+        from_form.assemble()
         probe = fem.Function(scene.u.function_space)
         probe.interpolate(rough_field(scene.dim, 3))
-        ours, other = (m.createVecLeft() for m in (mine, theirs))
-        mine.mult(probe.x.petsc_vec, ours)
-        theirs.mult(probe.x.petsc_vec, other)
+        ours, other = (m.createVecLeft() for m in (from_operator, from_form))
+        from_operator.mult(probe.x.petsc_vec, ours)
+        from_form.mult(probe.x.petsc_vec, other)
         size = global_max(comm, np.abs(ours.array_r))
         assert global_max(comm, np.abs(ours.array_r - other.array_r)) < 1e-11 * size
 
@@ -206,7 +206,7 @@ def test_frictionless_tangent_is_symmetric():
     assert not tresca.effective_law.has_potential
 
 
-def _refused(arguments, law=None, **options):
+def _contact_maker(arguments, law=None, **options):
     scene = rubber("triangle", 1, n=(2, 1))
 
     def make():
@@ -223,17 +223,17 @@ FLOOR = fc.HalfSpace((0, 1), (0, -1))
 @pytest.mark.parametrize(
     ("make", "error", "text"),
     [
-        (_refused(FLOOR, kinematics="large"), ValueError, "'small', 'finite'"),
-        (_refused(FLOOR, gap=0.1), ValueError, "gap is given"),
-        (_refused(FLOOR, law=fc.Foundation(K, K)), ValueError, "Foundation bonds"),
-        (_refused(fc.PrescribedGap(0.1, (0, 1))), ValueError, "SignedDistance(lambda x"),
+        (_contact_maker(FLOOR, kinematics="large"), ValueError, "'small', 'finite'"),
+        (_contact_maker(FLOOR, gap=0.1), ValueError, "gap is given"),
+        (_contact_maker(FLOOR, law=fc.Foundation(K, K)), ValueError, "Foundation bonds"),
+        (_contact_maker(fc.PrescribedGap(0.1, (0, 1))), ValueError, "SignedDistance(lambda x"),
         (
-            _refused(lambda s: fc.SignedDistance(lambda x: ufl.SpatialCoordinate(s.mesh)[1])),
+            _contact_maker(lambda s: fc.SignedDistance(lambda x: ufl.SpatialCoordinate(s.mesh)[1])),
             ValueError,
             "SignedDistance(lambda x",
         ),
         (
-            _refused(
+            _contact_maker(
                 lambda s: fc.HalfSpace(
                     (0, 1), (0, -1), displacement=0.1 * ufl.SpatialCoordinate(s.mesh)
                 )
@@ -242,22 +242,24 @@ FLOOR = fc.HalfSpace((0, 1), (0, -1))
             "varies over Γc",
         ),
         (
-            _refused(fc.HalfSpace((0, 1), (0, -1), rotation=0.1)),
+            _contact_maker(fc.HalfSpace((0, 1), (0, -1), rotation=0.1)),
             ValueError,
             "must be a Rotation",
         ),
         (
-            _refused(fc.HalfSpace((0, 1), (0, -1), rotation=fc.Rotation(0.1, (0, 0), (0, 0, 1)))),
+            _contact_maker(
+                fc.HalfSpace((0, 1), (0, -1), rotation=fc.Rotation(0.1, (0, 0), (0, 0, 1)))
+            ),
             ValueError,
             "omit it",
         ),
         (
-            _refused(fc.HalfSpace((0, 1), (0, -1), rotation=fc.Rotation(0.1, (0, 0, 0)))),
+            _contact_maker(fc.HalfSpace((0, 1), (0, -1), rotation=fc.Rotation(0.1, (0, 0, 0)))),
             ValueError,
             "about",
         ),
         (
-            _refused(
+            _contact_maker(
                 fc.HalfSpace((0, 1), (0, -1), rotation=fc.Rotation(0.1, (0, 0))),
                 kinematics="small",
             ),

@@ -48,7 +48,7 @@ def test_moving_the_body_or_the_tool_is_equivalent(cell, shape, enforcement):
         assert is_close(other.tractions(), one.tractions(), allowed)
 
 
-def _turned(tool, matrix, side, up):
+def _rotate_scene(tool, matrix, side, up):
     """Turn block and disc about the origin after displacing the disc by (side, up)."""
     centre = tool.vector(0.0, tool.scene.height + 0.8)
     tool.scene.move_bottom(lambda x: matrix @ x)
@@ -78,7 +78,7 @@ def test_rotation_of_the_whole_scene_rotates_the_tractions(cell, shape, enforcem
     axis = np.array([0.6, 0.0, 0.8])
     contact = {"enforcement": enforcement, "tolerance": 1e-9}
     allowed = 1e-9 if enforcement == "penalty" else 1e-7
-    still, tool = (DiscOnRubber(cell, contact=contact, shape=shape) for _ in range(2))
+    unrotated, tool = (DiscOnRubber(cell, contact=contact, shape=shape) for _ in range(2))
     if d == 3:
         obstacle = disc(
             tool.scene, 0.8, displacement=tool.shift, angle=tool.angle, axis=axis, shape=shape
@@ -87,9 +87,9 @@ def test_rotation_of_the_whole_scene_rotates_the_tractions(cell, shape, enforcem
             obstacle, fc.Coulomb(0.3, 1e4, 1e4), contact=contact, petsc_options=TIGHT_TOLERANCE
         )
     for side, up in PATH[:4]:
-        still.solve_increment(side, up)
+        unrotated.solve_increment(side, up)
         tool.solve_increment(side, up)
-    before = still.tractions()
+    before = unrotated.tractions()
     for angle, (side, up) in [*((a, PATH[3]) for a in (0.3, 0.6, 0.9, 1.2)), (1.2, PATH[4])]:
         c, s = np.cos(angle), np.sin(angle)
         matrix = np.array([[c, -s], [s, c]])
@@ -97,13 +97,13 @@ def test_rotation_of_the_whole_scene_rotates_the_tractions(cell, shape, enforcem
             x, y, z = axis
             across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
             matrix = np.eye(3) + s * across + (1 - c) * across @ across
-        tool.shift.value[:] = _turned(tool, matrix, side, up)
+        tool.shift.value[:] = _rotate_scene(tool, matrix, side, up)
         tool.angle.value = angle
         tool.problem.solve()
         tool.problem.commit()
         if (side, up) == PATH[4]:
-            still.solve_increment(side, up)
-            before = still.tractions()
+            unrotated.solve_increment(side, up)
+            before = unrotated.tractions()
         assert is_close(tool.tractions(), before @ matrix.T, allowed)
 
 
@@ -114,9 +114,9 @@ def test_small_and_finite_agree_to_first_order(law):
     The relative difference of the contact forces is proportional to the displacement: a quarter of
     it for a quarter of the displacement, to 25 % for terms of higher order.
     """
-    share = []
+    relative_errors = []
     for size in (4e-3, 1e-3):
-        found = []
+        computed = []
         for kinematics in ("finite", "small"):
             scene = rubber("triangle", n=(12, 6), linear=True, bend=bend_top)
             shift = fem.Constant(scene.mesh, np.zeros(2))
@@ -131,10 +131,12 @@ def test_small_and_finite_agree_to_first_order(law):
                 shift.value[:] = size * side, size * up
                 problem.solve()
                 problem.commit()
-            found.append(contact.resultants().force)
-        share.append(np.linalg.norm(found[0] - found[1]) / np.linalg.norm(found[1]))
-    assert share[0] > 1e-5
-    assert share[0] / share[1] == pytest.approx(4.0, rel=0.25)
+            computed.append(contact.resultants().force)
+        relative_errors.append(
+            np.linalg.norm(computed[0] - computed[1]) / np.linalg.norm(computed[1])
+        )
+    assert relative_errors[0] > 1e-5
+    assert relative_errors[0] / relative_errors[1] == pytest.approx(4.0, rel=0.25)
 
 
 def test_frictionless_loop_does_no_work():
@@ -147,8 +149,8 @@ def test_frictionless_loop_does_no_work():
     corners = [(0, 0, 0), (0, -0.15, 0), (0.2, -0.15, 1), (0.2, 0, 1)]
     work, peak = 0.0, 0.0
     for start, end in pairwise(corners):
-        for share in np.arange(1, 17) / 16:
-            side, up, angle = (1 - share) * np.array(start) + share * np.array(end)
+        for fraction in np.arange(1, 17) / 16:
+            side, up, angle = (1 - fraction) * np.array(start) + fraction * np.array(end)
             step = tool.solve_increment(side, up, angle)
             work += step.energy.work
             peak = max(peak, work)
@@ -245,8 +247,8 @@ def test_newton_converges_quadratically():
     tool.problem.snes.setMonitor(lambda snes, i, norm: norms.append(norm))
     tool.solve_increment(0.0, -0.11)
     norms = [norm for norm in norms if norm > 0]  # zero may be reached exactly
-    shares = np.log10(np.array(norms[-3:]) / norms[0])
-    assert shares[2] < 1.7 * shares[1]
+    orders = np.log10(np.array(norms[-3:]) / norms[0])
+    assert orders[2] < 1.7 * orders[1]
     assert len(norms) < 8
 
 

@@ -158,9 +158,9 @@ def test_rubber_block_pressed_turned_and_dragged():
         iterations += problem.solve().iterations
         problem.commit()
         (x, y), centre = contact.resultants().force, (shift.value[0], 14.0 + shift.value[1])
-        found = np.array([x, y, contact.moment(centre)[0] / 4.0])
-        wanted = np.array(expected) / (1.0, 1.0, 4.0)
-        assert found == pytest.approx(wanted, abs=1e-7 * abs(expected[1]))
+        computed = np.array([x, y, contact.moment(centre)[0] / 4.0])
+        reference = np.array(expected) / (1.0, 1.0, 4.0)
+        assert computed == pytest.approx(reference, abs=1e-7 * abs(expected[1]))
     # GetFEM: 282; without the tractions of sticking points in the predictor 170.
     assert iterations <= 115
 
@@ -174,21 +174,21 @@ def test_rubber_block_dragged_over_another(friction):
     with multipliers linear along the side, has forces of 137.7 and 40.35 at the end, 3.5 % more:
     nothing penetrates, here by up to 4 % of the depth.
     """
-    made = sliding_rubber_block.SlidingRubberBlock(friction)
+    setup = sliding_rubber_block.SlidingRubberBlock(friction)
     problem = fc.ContactProblem(
-        made.residual,
-        made.u,
-        bcs=made.bcs,
-        contacts=[made.contact],
+        setup.residual,
+        setup.u,
+        bcs=setup.bcs,
+        contacts=[setup.contact],
         petsc_options={"snes_rtol": 1e-11},
     )
     iterations, size = 0, 135.0
     for place, expected in zip(sliding_rubber_block.PATH, GETFEM_TWO[friction], strict=False):
-        made.set_top_displacement(*place)
+        setup.set_top_displacement(*place)
         iterations += problem.solve().iterations
         problem.commit()
-        found = made.contact.resultants().force
-        assert found == pytest.approx(np.array(expected), abs=1e-7 * size)
+        computed = setup.contact.resultants().force
+        assert computed == pytest.approx(np.array(expected), abs=1e-7 * size)
     # GetFEM with full steps, to 1e-9: 200 with friction, 27 in five increments without it.
     assert iterations <= (125 if friction else 30)
 

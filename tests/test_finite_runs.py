@@ -102,7 +102,7 @@ def test_small_displacement_error_is_that_to_finite_kinematics():
 
     A disc is pressed into a linear elastic block, with the same penalty in both cases.
     """
-    found = {}
+    computed = {}
     for kinematics in ("small", "finite"):
         scene = rubber("triangle", n=(16, 8), linear=True)
         shift = fem.Constant(scene.mesh, np.zeros(2))
@@ -116,13 +116,13 @@ def test_small_displacement_error_is_that_to_finite_kinematics():
         for shift.value[0] in (0.0, 0.02, 0.04):
             step = problem.solve()
             problem.commit()
-        found[kinematics] = contact.resultants().force
+        computed[kinematics] = contact.resultants().force
         if kinematics == "small":
-            told = step.verdict.small_displacement_error["contact"].force
-    difference = np.linalg.norm(found["finite"] - found["small"])
-    share = difference / np.linalg.norm(found["small"])
-    assert share > 0.01
-    assert told == pytest.approx(share, rel=0.3)
+            estimate = step.verdict.small_displacement_error["contact"].force
+    difference = np.linalg.norm(computed["finite"] - computed["small"])
+    relative_error = difference / np.linalg.norm(computed["small"])
+    assert relative_error > 0.01
+    assert estimate == pytest.approx(relative_error, rel=0.3)
 
 
 @pytest.mark.parametrize("shape", ["ball", "profile"])
@@ -132,8 +132,8 @@ def test_form_in_a_user_defined_problem(shape):
     The body is hyperelastic, with friction, in two increments; the residual is F + contact.form(v).
     An obstacle from data is sampled by `Contact.evaluate` whenever u has changed.
     """
-    own, reference = (DiscOnRubber("triangle", n=(8, 4), shape=shape) for _ in range(2))
-    scene, contact = own.scene, own.contact
+    user_problem, reference = (DiscOnRubber("triangle", n=(8, 4), shape=shape) for _ in range(2))
+    scene, contact = user_problem.scene, user_problem.contact
     space = scene.u.function_space
     v, du = ufl.TestFunction(space), ufl.TrialFunction(space)
     residual = scene.F + contact.form(v)
@@ -145,7 +145,7 @@ def test_form_in_a_user_defined_problem(shape):
     solver.getPC().setType("lu")
     solver.getPC().setFactorSolverType("mumps")
     for side, up in ((0.0, -0.03), (0.02, -0.04)):
-        own.shift.value[:] = side, up
+        user_problem.shift.value[:] = side, up
         for _ in range(30):
             if shape == "profile":
                 contact.evaluate()
@@ -164,4 +164,4 @@ def test_form_in_a_user_defined_problem(shape):
         contact.commit()
         reference.solve_increment(side, up)
     assert np.abs(reference.resultant()[0]) > 0.1
-    assert is_close(own.tractions(), reference.tractions(), 1e-9)
+    assert is_close(user_problem.tractions(), reference.tractions(), 1e-9)

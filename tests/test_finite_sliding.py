@@ -60,8 +60,10 @@ class Pair:
         Collective.
         """
         widths, shift = ((1.0, 0.6), 0.17) if n == (4, 3) else ((1.0, 1.0), 0.0)
-        made = two_blocks(cell, n, widths, shift) if like is None else (like.mesh, like.tags)
-        self.mesh, self.tags = mesh, tags = made
+        mesh_and_tags = (
+            two_blocks(cell, n, widths, shift) if like is None else (like.mesh, like.tags)
+        )
+        self.mesh, self.tags = mesh, tags = mesh_and_tags
         self.d = mesh.geometry.dim
         self.u = fem.Function(displacement_space(mesh, degree))
         surface = fc.ContactSurface(mesh, tags, UPPER_FACE)
@@ -117,7 +119,7 @@ def turn(d: int, angle: float) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def loaded(pair: Pair, along: float) -> None:
+def set_loaded_state(pair: Pair, along: float) -> None:
     """Commit a state of rotated bodies, then rotate, press and shear them further."""
     d = pair.d
     pair.place(pair.pressed(pair.perturbed_nodes(0.01, 1), 0.04, 0.0) @ turn(d, 0.7).T)
@@ -132,20 +134,20 @@ def loaded(pair: Pair, along: float) -> None:
 def test_tangent_is_the_derivative_of_the_forces(cell, degree, along, law):
     """Central differences with steps of 1e-6 give the tangent to 1e-6 of the largest entry."""
     pair = Pair(cell, LAWS[law], degree=degree, kinematics="finite")
-    loaded(pair, along)
+    set_loaded_state(pair, along)
     pair.contact.evaluate()
     resultants = pair.contact.resultants()
     assert resultants.max_penetration > 0.01
     operator = ContactOperator(pair.contact)
     tangent = operator.tangent()
     direction = pair.perturbed_nodes(1.0, 5) - pair.nodes
-    here = pair.nodes + pair.u.x.array.reshape(-1, pair.d)
+    positions = pair.nodes + pair.u.x.array.reshape(-1, pair.d)
     vector, product = operator.unknowns.vector(), operator.unknowns.vector()
     vector.array[:] = direction.ravel()[: vector.array.size]
     tangent.mult(vector, product)
     forces = []
     for step in (1e-6, -1e-6):
-        pair.place(here + step * direction)
+        pair.place(positions + step * direction)
         forces.append(pair.force())
     slope = (forces[0] - forces[1]) / 2e-6
     size = MPI.COMM_WORLD.allreduce(np.abs(slope).max(initial=0.0), op=MPI.MAX)
@@ -154,14 +156,14 @@ def test_tangent_is_the_derivative_of_the_forces(cell, degree, along, law):
 
 def test_states_of_the_tangent_test_have_slip_and_stick():
     """The two states of the tangent test include sticking and slipping points."""
-    found = set()
+    states = set()
     for along in (0.004, 0.08):
         pair = Pair("triangle", LAWS["coulomb"], kinematics="finite")
-        loaded(pair, along)
+        set_loaded_state(pair, along)
         pair.contact.evaluate()
         r = pair.contact.resultants()
-        found |= {name for name in ("stick", "slip") if getattr(r, name)}
-    assert found == {"stick", "slip"}
+        states |= {name for name in ("stick", "slip") if getattr(r, name)}
+    assert states == {"stick", "slip"}
 
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron"])
@@ -170,7 +172,7 @@ def test_contact_forces_are_frame_invariant(cell):
     forces, pair = [], None
     for angle in (0.0, 0.9, -2.5):
         pair = Pair(cell, LAWS["coulomb"], like=pair, kinematics="finite")
-        loaded(pair, 0.004)
+        set_loaded_state(pair, 0.004)
         x = (pair.nodes + pair.u.x.array.reshape(-1, pair.d)) @ turn(pair.d, angle).T
         pair.place(x + 0.3)
         forces.append(pair.force().reshape(-1, pair.d) @ turn(pair.d, angle))
@@ -184,7 +186,7 @@ def test_contact_forces_are_frame_invariant(cell):
 def test_forces_on_both_bodies_cancel(cell):
     """The resultant is round-off; the moment is at most gap times tangential traction, summed."""
     pair = Pair(cell, LAWS["coulomb"], kinematics="finite")
-    loaded(pair, 0.08)
+    set_loaded_state(pair, 0.08)
     force = pair.force().reshape(-1, pair.d)
     pair.contact.evaluate()
     comm = MPI.COMM_WORLD
@@ -262,14 +264,14 @@ class Blocks:
         return list(fc.increments(self.problem, self.load, 0.0, until, steps=steps, **options))
 
 
-WAY = [0.5, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0]
+SLIDE_LOADS = [0.5, 1.0, 1.2, 1.4, 1.6, 1.8, 2.0]
 
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 def test_block_slides_over_several_facets(enforcement):
     """Sliding over three facets: T = μ N to 1e-9 (augmented 1e-4), dissipation μ N w to 10 %."""
     blocks = Blocks("triangle", fc.Coulomb(0.2), (6, 4), enforcement=enforcement)
-    steps = blocks.history(2.0, WAY)
+    steps = blocks.history(2.0, SLIDE_LOADS)
     force = steps[-1].contacts["contact"]
     assert force.slip > 0 and force.stick == 0
     # Resultants along and across the present normals: the tractions are on the friction cone.
@@ -285,27 +287,31 @@ def test_sliding_and_load_reversal_take_few_newton_steps():
     In the first increment after the load reversal all points stick, and so does the predictor.
     """
     blocks = Blocks("triangle", fc.Coulomb(0.3), (12, 6))
-    forth = [step.iterations for step in blocks.history(2.0, WAY)]
-    rest = fc.increments(blocks.problem, blocks.load, 2.0, 1.5, steps=10)
-    back = [step.iterations for step in rest]
+    forth = [step.iterations for step in blocks.history(2.0, SLIDE_LOADS)]
+    remaining = fc.increments(blocks.problem, blocks.load, 2.0, 1.5, steps=10)
+    back = [step.iterations for step in remaining]
     assert sum(forth) <= 40 and sum(back) <= 34 and back[0] <= 4
 
 
 def test_resumed_history_equals_the_uninterrupted_one(tmp_path):
     """Contact forces of a history resumed from a checkpoint are those without a stop, to 1e-9."""
     path = MPI.COMM_WORLD.bcast(tmp_path) / "state"
-    whole = Blocks("triangle", fc.Coulomb(0.2), (6, 4))
-    steps = whole.history(2.0, WAY)
+    uninterrupted = Blocks("triangle", fc.Coulomb(0.2), (6, 4))
+    steps = uninterrupted.history(2.0, SLIDE_LOADS)
     first = Blocks("triangle", fc.Coulomb(0.2), (6, 4))
-    for step in fc.increments(first.problem, first.load, 0.0, 2.0, steps=WAY, checkpoint=path):
+    for step in fc.increments(
+        first.problem, first.load, 0.0, 2.0, steps=SLIDE_LOADS, checkpoint=path
+    ):
         if step.load >= 1.4:
             break
-    again = Blocks("triangle", fc.Coulomb(0.2), (6, 4))
-    rest = list(fc.increments(again.problem, again.load, 0.0, 2.0, steps=WAY, checkpoint=path))
-    assert len(rest) == 3
-    for step, other in zip(rest, steps[-3:], strict=True):
-        mine, theirs = step.contacts["contact"], other.contacts["contact"]
-        np.testing.assert_allclose(mine.force, theirs.force, rtol=1e-9)
+    resumed = Blocks("triangle", fc.Coulomb(0.2), (6, 4))
+    remaining = list(
+        fc.increments(resumed.problem, resumed.load, 0.0, 2.0, steps=SLIDE_LOADS, checkpoint=path)
+    )
+    assert len(remaining) == 3
+    for step, other in zip(remaining, steps[-3:], strict=True):
+        resumed_results, expected_results = step.contacts["contact"], other.contacts["contact"]
+        np.testing.assert_allclose(resumed_results.force, expected_results.force, rtol=1e-9)
 
 
 def test_rotated_patch_has_uniform_pressure():
@@ -331,7 +337,7 @@ def _rotated_pair(cell, path):
     return pair
 
 
-def _crossed(pair):
+def _tunnelling_point(pair):
     """Return a point that has crossed the other body since the last commit, or None."""
     return TunnellingCheck([pair.contact]).evaluate(pair.before)["contact"].crossed
 
@@ -366,7 +372,7 @@ def test_probe_of_rotated_bodies_has_the_deformed_positions():
 def test_tunnelling_through_rotated_bodies_is_detected(cell, path, through):
     """Only points whose path in an increment enters the body too deep or leaves it are reported."""
     pair = _rotated_pair(cell, path)
-    assert (_crossed(pair) is not None) == through
+    assert (_tunnelling_point(pair) is not None) == through
 
 
 @pytest.mark.each
@@ -384,7 +390,7 @@ def test_tunnelling_of_unpaired_points_is_detected(cell, path, through):
     """Tunnelling is detected although no point has an opposite point after the increment."""
     pair = _rotated_pair(cell, path)
     assert not MPI.COMM_WORLD.allreduce(int(pair.contact.values.paired.any()))
-    assert (_crossed(pair) is not None) == through
+    assert (_tunnelling_point(pair) is not None) == through
 
 
 def test_number_of_newton_steps_is_independent_of_units_and_rotation():
@@ -393,7 +399,7 @@ def test_number_of_newton_steps_is_independent_of_units_and_rotation():
     Otherwise, rotated or in another unit of length, the first increment takes at least 14 steps
     instead of 5.
     """
-    found = []
+    computed = []
     for size, angle in ((1.0, 0.0), (1e-3, 0.0), (1.0, 0.9)):
         blocks = Blocks("triangle", fc.Coulomb(0.3), (12, 8), size=size, angle=angle)
         steps = []
@@ -402,8 +408,8 @@ def test_number_of_newton_steps_is_independent_of_units_and_rotation():
                 value.value = part
             steps.append(blocks.problem.solve().iterations)
             blocks.problem.commit()
-        found.append(steps)
-    assert found[1] == found[0] and found[2] == found[0]
+        computed.append(steps)
+    assert computed[1] == computed[0] and computed[2] == computed[0]
 
 
 def test_increment_that_crosses_the_other_body_fails_or_is_cut():
@@ -490,12 +496,12 @@ def test_initial_overlap_of_several_cells_is_resolved(cell):
     assert contact.resultants().normal_force == pytest.approx(k * (stretch - 0.8), rel=1e-9)
 
 
-def slotted() -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
+def slotted_plate() -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
     """Return a plate slotted from its right side; tags of both slot faces, bottom and top."""
-    whole = dolfinx.mesh.create_rectangle(
+    rectangle = dolfinx.mesh.create_rectangle(
         MPI.COMM_SELF, [[0, 0], [2, 1.1]], (20, 11), dolfinx.mesh.CellType.quadrilateral
     )
-    x, cells = whole.geometry.x[:, :2].copy(), compat.geometry_dofmap(whole)
+    x, cells = rectangle.geometry.x[:, :2].copy(), compat.geometry_dofmap(rectangle)
     middle = x[cells].mean(axis=1)
     slot = (middle[:, 0] > 0.5) & (np.abs(middle[:, 1] - 0.55) < 0.05)
     mesh = create_mesh("quadrilateral", x, cells[~slot])
@@ -514,18 +520,20 @@ def test_self_contact_has_the_force_of_two_named_surfaces():
     Both faces then have quadrature points, at different positions, each with half the stiffness.
     """
     forces = []
-    for own, opposite, share in (
+    for slave, opposite, stiffness_ratio in (
         (UPPER_FACE, LOWER_FACE, 20),
         ([LOWER_FACE, UPPER_FACE], [LOWER_FACE, UPPER_FACE], 10),
     ):
-        mesh, tags = slotted()
+        mesh, tags = slotted_plate()
         u = fem.Function(displacement_space(mesh, 1))
         down = fem.Constant(mesh, 0.0)
         contact = fc.Contact(
             u,
-            fc.ContactSurface(mesh, tags, own),
+            fc.ContactSurface(mesh, tags, slave),
             fc.DeformableBody(tags, opposite),
-            fc.Coulomb(0.2, fc.RelativeStiffness(share), fc.RelativeStiffness(share)),
+            fc.Coulomb(
+                0.2, fc.RelativeStiffness(stiffness_ratio), fc.RelativeStiffness(stiffness_ratio)
+            ),
             kinematics="finite",
         )
         body = NeoHookean(u, 100.0, 0.3, "plane strain")
@@ -563,8 +571,8 @@ def test_residual_of_a_degenerate_surface_is_nan():
     pair = Pair("tetrahedron", LAWS["coulomb"], kinematics="finite")
     bcs = [dirichlet_bc(pair.u, pair.tags, tag, i) for tag in (BOTTOM, TOP) for i in range(3)]
     form = residual(pair.u, ufl.TestFunction(pair.u.function_space), 100.0, 0.3)
-    whole = {"bcs": bcs, "contacts": [pair.contact], "condensation": False}
-    problem = fc.ContactProblem(form, pair.u, **whole)
+    options = {"bcs": bcs, "contacts": [pair.contact], "condensation": False}
+    problem = fc.ContactProblem(form, pair.u, **options)
     x = pair.nodes
     line = x.copy()
     line[np.isclose(x[:, 2], 0.5), 1] = 0.5
@@ -581,17 +589,17 @@ def test_candidate_facets_include_those_crossed_in_the_increment(cell):
     """Candidates are found where bodies overlap or have crossed in the increment, else none."""
     pair = Pair(cell, LAWS["coulomb"], kinematics="finite")
     search, before = pair.contact.pairs.search, pair.u.copy()
-    every, counts = len(search.rays.slave.facets.cells), []
+    n_facets, counts = len(search.rays.slave.facets.cells), []
     # Apart by more than a cell; into each other; through each other; beyond and at rest.
     for old, new in ((-2.0, -3.0), (-2.0, 0.01), (-2.0, 3.0), (3.0, 3.0)):
         pair.place(pair.pressed(pair.nodes, old, 0.0))
         before.x.array[:] = pair.u.x.array
         pair.place(pair.pressed(pair.nodes, new, 0.0))
-        found = search.find_candidate_facets(pair.u, before, 0.0)
-        total = [COMM.allreduce(len(near)) for near in found]
+        candidates = search.find_candidate_facets(pair.u, before, 0.0)
+        total = [COMM.allreduce(len(near)) for near in candidates]
         counts.append(total)
         if new > old:  # all of Γc is opposite to the other body
-            assert total[0] == COMM.allreduce(every) and total[1] > 0
+            assert total[0] == COMM.allreduce(n_facets) and total[1] > 0
     assert counts[0] == counts[3] == [0, 0]
 
 
@@ -603,7 +611,7 @@ def test_static_condensation_gives_the_full_solution(cell, degree):
 
     A block is pressed, and dragged over facets of the other one, with a single factorisation.
     """
-    found, pair = [], None
+    computed, pair = [], None
     for condensation in (True, False):
         pair = Pair(cell, fc.Coulomb(0.3), degree=degree, like=pair, kinematics="finite")
         mesh, tags, last = pair.mesh, pair.tags, pair.d - 1
@@ -629,23 +637,23 @@ def test_static_condensation_gives_the_full_solution(cell, degree):
             assert step.complete  # the checks need all of u, so it is recovered
             assert not condensation or step.factorisations == (number == 0)
             history.append([*step.contacts["contact"].force, *step.contacts["contact"].moment])
-        found.append((np.array(history), pair.u.x.array.copy()))
-    for condensed, whole in zip(*found, strict=True):
-        assert condensed == pytest.approx(whole, rel=0, abs=1e-10 * np.abs(whole).max())
+        computed.append((np.array(history), pair.u.x.array.copy()))
+    for condensed, full in zip(*computed, strict=True):
+        assert condensed == pytest.approx(full, rel=0, abs=1e-10 * np.abs(full).max())
 
 
-@pytest.mark.parametrize("held", [True, False])
-def test_condensation_requires_constrained_bodies(held):
+@pytest.mark.parametrize("constrained", [True, False])
+def test_condensation_requires_constrained_bodies(constrained):
     """A body constrained by contact only may be ejected, and its check needs all dofs."""
     pair = Pair("triangle", fc.Coulomb(0.3), kinematics="finite")
-    tags = (BOTTOM, TOP) if held else (BOTTOM,)
+    tags = (BOTTOM, TOP) if constrained else (BOTTOM,)
     bcs = [dirichlet_bc(pair.u, pair.tags, tag, i) for tag in tags for i in range(2)]
     form = residual(pair.u, ufl.TestFunction(pair.u.function_space), 1e3, 0.3)
-    given = (form, pair.u), {"bcs": bcs, "contacts": [pair.contact]}
-    assert fc.ContactProblem(*given[0], **given[1]).solver.condensed == held
-    if not held:
+    arguments = (form, pair.u), {"bcs": bcs, "contacts": [pair.contact]}
+    assert fc.ContactProblem(*arguments[0], **arguments[1]).solver.condensed == constrained
+    if not constrained:
         with pytest.raises(ValueError, match="constrained by contact only"):
-            fc.ContactProblem(*given[0], **given[1], condensation=True)
+            fc.ContactProblem(*arguments[0], **arguments[1], condensation=True)
 
 
 def test_all_points_of_a_joint_slip_below_the_friction_limit() -> None:
@@ -666,12 +674,12 @@ def test_all_points_of_a_joint_slip_below_the_friction_limit() -> None:
         joint(body, 2, law, swap=True, **finite),
     ]
     problem = body.problem(*contacts)
-    for share in np.linspace(0.0, 0.95, 7):
-        angle = np.arctan(0.3 * share)
+    for factor in np.linspace(0.0, 0.95, 7):
+        angle = np.arctan(0.3 * factor)
         weight.value[:] = 1e3 * np.sin(angle), -1e3 * np.cos(angle)
         step = problem.solve()
         problem.commit()
         assert [attempt.method for attempt in step.attempts] == ["newton"]
         for contact in contacts:
             force = contact.resultants().force
-            assert abs(force[0]) == pytest.approx(0.3 * share * abs(force[1]), rel=1e-6, abs=1e-6)
+            assert abs(force[0]) == pytest.approx(0.3 * factor * abs(force[1]), rel=1e-6, abs=1e-6)

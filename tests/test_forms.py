@@ -156,8 +156,8 @@ EQUIVALENT_FORMS = {
     "one measure with data, all cells": lambda s: (
         s.work(s.E) * s.dx - s.loads(s.dx(UPPER), s.ds(TOP))
     ),
-    "plain beside tagged": lambda s: s.work(s.E) * ufl.dx - s.loads(s.dx(UPPER), s.ds(TOP)),
-    "plain facets beside tagged": lambda s: (
+    "plain next to tagged": lambda s: s.work(s.E) * ufl.dx - s.loads(s.dx(UPPER), s.ds(TOP)),
+    "plain facets next to tagged": lambda s: (
         s.plain() + fem.Constant(s.mesh, 0.0) * ufl.dot(s.u, s.v) * ufl.ds
     ),
     "by an energy": lambda s: (
@@ -203,7 +203,7 @@ VECTOR, SCALAR = (
 def test_two_materials_in_a_mixed_form(parts):
     """Displacement and pressure of a mixed function, in any order, over tags: E is 3 G, 1e-9."""
     element = basix.ufl.mixed_element(parts)
-    found = []
+    computed = []
     for tagged in (True, False):
         s = Layers(element)
 
@@ -217,15 +217,15 @@ def test_two_materials_in_a_mixed_form(parts):
             F -= s.loads(s.dx(UPPER), s.ds(TOP))
         else:
             F = work(s.E) * ufl.dx - s.pull * s.v[0] * ufl.dx + s.pressure * s.v[1] * s.ds(TOP)
-        found.append(s.solved(F))
-    (u, k_n), (expected, stiffness) = found
+        computed.append(s.solved(F))
+    (u, k_n), (expected, stiffness) = computed
     assert is_close(u, expected, 1e-9) and is_close(k_n, stiffness, 1e-9)
     assert is_close(k_n, np.full(k_n.shape, 10 * 3 * E[LOWER] / (2 * (1 + NU)) * 4), 1e-9)
 
 
 def test_two_nonlinear_materials():
     """A nonlinear bulk over tags with their own rules, against coefficients by cell, 1e-9."""
-    found = []
+    computed = []
     for tagged in (True, False):
         s = Layers()
         rules = [
@@ -242,8 +242,8 @@ def test_two_nonlinear_materials():
             F = NeoHookean(s.u, s.E, NU, "plane strain").residual(s.v, rules[0])
             F += s.pressure * s.v[1] * s.ds(TOP) - s.pull * s.v[0] * ufl.dx
         s.pressure.value = 50.0
-        found.append(s.solved(F))
-    (u, k_n), (expected, stiffness) = found
+        computed.append(s.solved(F))
+    (u, k_n), (expected, stiffness) = computed
     assert is_close(u, expected, 1e-9) and is_close(k_n, stiffness, 1e-9)
 
 
@@ -253,7 +253,7 @@ def test_two_quadrature_rules_over_the_same_tags(kind):
 
     In one form, DOLFINx 0.9 silently assembles one of them, in residual, tangent and E.
     """
-    found = []
+    computed = []
     for tagged in (True, False):
         s = Layers()
         rule = {"quadrature_degree": 4}
@@ -268,14 +268,14 @@ def test_two_quadrature_rules_over_the_same_tags(kind):
             both = [s.ds(t, metadata=rule if tagged else {}) for t in (LEFT, RIGHT)]
             F += bed * both[0] + 2 * bed * both[1]
             F += bed * s.ds((LEFT, RIGHT)) + s.v[0] * s.ds((LEFT, RIGHT))
-        found.append(s.solved(F))
-    (u, k_n), (expected, stiffness) = found
+        computed.append(s.solved(F))
+    (u, k_n), (expected, stiffness) = computed
     assert is_close(u, expected, 1e-9) and is_close(k_n, stiffness, 1e-9)
 
 
 def test_joined_bodies():
     """Two bodies in contact, with materials over ``joined.body``, against `by_body`, 1e-9."""
-    found = []
+    computed = []
     for tagged in (True, False):
         lower, upper = (block_mesh("quadrilateral", n=n) for n in (2, 3))
         upper[0].geometry.x[:, 1] += 1.0
@@ -306,20 +306,20 @@ def test_joined_bodies():
         below = fc.DeformableBody(joined.facets, joined.facet("lower", TOP))
         contact = fc.Contact(u, surface, below, fc.Coulomb(0.3))
         fc.ContactProblem(F, u, bcs=bcs, contacts=[contact], petsc_options=TIGHT).solve()
-        found.append((nodal_values(u), point_values(contact, contact.values.parameters["k_n"])))
-    (u, k_n), (expected, stiffness) = found
+        computed.append((nodal_values(u), point_values(contact, contact.values.parameters["k_n"])))
+    (u, k_n), (expected, stiffness) = computed
     assert is_close(u, expected, 1e-9) and is_close(k_n, stiffness, 1e-9)
 
 
 def test_interior_facets_with_tagged_cells():
     """Integrals over interior facets need no tags if those over cells have tags, 1e-9."""
-    found = []
+    computed = []
     for tagged in (True, False):
         s = Layers(ghost_mode=dolfinx.mesh.GhostMode.shared_facet)
         jumps = ufl.inner(ufl.jump(ufl.grad(s.u)), ufl.jump(ufl.grad(s.v))) * ufl.dS(s.mesh)
         F = EQUIVALENT_FORMS["two materials"](s) if tagged else s.plain()
-        found.append(s.solved(F + fem.Constant(s.mesh, 10.0) * jumps))
-    (u, k_n), (expected, stiffness) = found
+        computed.append(s.solved(F + fem.Constant(s.mesh, 10.0) * jumps))
+    (u, k_n), (expected, stiffness) = computed
     assert is_close(u, expected, 1e-9) and is_close(k_n, stiffness, 1e-9)
 
 
@@ -395,16 +395,16 @@ def test_inertia_is_not_counted_as_stiffness(kind):
     F += weight * 0.1 * ufl.dot(ufl.grad(u) * wind, v) * ufl.dx
     surface = fc.ContactSurface(mesh, tags, BOTTOM)
     floor = fc.HalfSpace(np.zeros(d), np.eye(d)[-1])
-    found = []
+    computed = []
     for exponent in range(-8, 8, 3):
         dt.value = 10.0**exponent
         contact = fc.Contact(
             u, surface, floor, fc.Coulomb(0.3, fc.RelativeStiffness(5.0)), weight=weight
         )
         fc.ContactProblem(F, u, contacts=[contact])
-        found.append(point_values(contact, contact.values.parameters["k_n"]))
+        computed.append(point_values(contact, contact.values.parameters["k_n"]))
     # The height of a cell is half of that of the block.
-    assert is_close(found, np.full_like(found, 5.0 * E[LOWER] * 2), 1e-9)
+    assert is_close(computed, np.full_like(computed, 5.0 * E[LOWER] * 2), 1e-9)
 
 
 def test_inertia_in_a_mixed_form():

@@ -49,7 +49,7 @@ class Strengthening(fc.Coulomb):
         return (parameters["friction"] + parameters["rate"] * distance) * pressure
 
 
-def low_block(law, side, cell="quadrilateral", **options):
+def dragged_block(law, side, cell="quadrilateral", **options):
     """Return problem and contact of a block of weight 1, pulled along the floor at its top."""
     size = {"size": (1.0, 1.0, 0.1), "n": (2, 2, 1)} if cell == "hexahedron" else {}
     scene = block(cell, up=-1.0, side=side, **(LOW | size))
@@ -66,7 +66,7 @@ def test_cohesion_adds_to_the_friction_limit(cell):
     The tangential force is the load, to 1e-7; the solver stops at 1e-9 of the forces.
     """
     law = Cohesive(MU, k_n=1e5, k_t=1e5, cohesion=COHESION)
-    problem, _ = low_block(law, 1.25, cell)
+    problem, _ = dragged_block(law, 1.25, cell)
     step = problem.solve()
     assert step.verdict.failures == []
     assert step.contacts["contact"].force[0] == pytest.approx(-1.25, rel=1e-7)
@@ -75,7 +75,7 @@ def test_cohesion_adds_to_the_friction_limit(cell):
 def test_load_above_the_limit_with_cohesion_is_an_overload():
     """The error states the friction limit, 1.3, although the friction bound is not μ p."""
     law = Cohesive(MU, k_n=1e5, k_t=1e5, cohesion=COHESION)
-    problem, _ = low_block(law, 1.35)
+    problem, _ = dragged_block(law, 1.35)
     assert_raised_on_all_ranks(problem.solve, fc.NotConverged, "overload", "at most 1.3")
 
 
@@ -132,21 +132,21 @@ def test_asymmetric_yield_surface_is_not_refused_as_overload():
             t, more, less = self._sided(kinematics, bound)
             trial = kinematics.traction - parameters["k_t"] * kinematics.tangential_increment
             along = ufl.dot(trial, t)
-            kept = ufl.min_value(ufl.max_value(along, -less), more)
+            bounded = ufl.min_value(ufl.max_value(along, -less), more)
             beyond = along - more, -along - less
             slip = tuple(ufl.max_value(b, 0) / parameters["k_t"] for b in beyond)
-            return kept * t, slip
+            return bounded * t, slip
 
-    bears, slips = [], []
+    has_force, slips = [], []
     for side in (0.5, -0.5):
-        problem, _ = low_block(OneSided(MU, **K), side)
+        problem, _ = dragged_block(OneSided(MU, **K), side)
         try:
             step = problem.solve()
         except fc.NotConverged:
             slips.append(side)
         else:
-            bears.append(step.contacts["contact"].force[0])
-    assert len(bears) == len(slips) == 1
+            has_force.append(step.contacts["contact"].force[0])
+    assert len(has_force) == len(slips) == 1
 
 
 # ---- friction that depends on the slip distance --------------------------------------------------
@@ -160,7 +160,7 @@ def test_friction_coefficient_that_grows_with_the_slip_distance(cell, method):
     It is above the limit for constant μ. The block's deformation is some 1e-6 of the slip distance.
     """
     law = Strengthening(MU, k_n=1e6, k_t=1e6, rate=RATE)
-    problem, contact = low_block(law, 0.4, cell, method=method)
+    problem, contact = dragged_block(law, 0.4, cell, method=method)
     for _ in range(2):
         step = problem.solve()
         assert step.verdict.failures == [] and step.contacts["contact"].stick == 0

@@ -30,11 +30,11 @@ pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 @pytest.mark.parametrize("cell", CELLS)
 def test_integrals_equal_sums_over_quadrature_points(cell):
     """Forms on the body's mesh have facets of all orientations; nodal values remain in range."""
-    made = BlockOnBall(cell=cell, degree=2, mesh={"n": 4, "shuffled": True})
-    made.problem.small_displacement_tolerance = np.inf
-    list(fc.increments(made.problem, made.load, 0, 2, steps=2))
-    contact, d = made.contact, made.scene.dim
-    ds = ufl.ds(made.scene.mesh, subdomain_data=made.scene.tags)(BOTTOM)
+    setup = BlockOnBall(cell=cell, degree=2, mesh={"n": 4, "shuffled": True})
+    setup.problem.small_displacement_tolerance = np.inf
+    list(fc.increments(setup.problem, setup.load, 0, 2, steps=2))
+    contact, d = setup.contact, setup.scene.dim
+    ds = ufl.ds(setup.scene.mesh, subdomain_data=setup.scene.tags)(BOTTOM)
     for name, values in (
         ("pressure", contact.pressure),
         ("traction", contact.traction),
@@ -43,17 +43,17 @@ def test_integrals_equal_sums_over_quadrature_points(cell):
         ("slip", contact.slip.sum(axis=1)),
         ("normal", contact.values.normal),
     ):
-        found = contact.function(name)
+        computed = contact.function(name)
         n = 1 if values.ndim == 1 else d
         rows = values.reshape(-1, n)
-        parts = [found] if values.ndim == 1 else [found[i] for i in range(d)]
+        parts = [computed] if values.ndim == 1 else [computed[i] for i in range(d)]
         sums = [assemble_scalar(compile_with_maps(part * ds, contact), COMM) for part in parts]
         expected = COMM.allreduce(contact.measure @ rows)
         size = COMM.allreduce(contact.measure @ np.abs(rows))
         assert is_close(sums, expected, 1e-12, scale=size.max()), name
         everywhere = gather(COMM, rows)
         low, high = everywhere.min(axis=0), everywhere.max(axis=0)
-        nodal = found.x.array.reshape(-1, n)
+        nodal = computed.x.array.reshape(-1, n)
         assert COMM.allreduce(int(np.any((nodal < low) | (nodal > high)))) == 0, name
     force = contact.resultants().normal_force
     pressure = contact.function("pressure")
@@ -62,14 +62,14 @@ def test_integrals_equal_sums_over_quadrature_points(cell):
 
 def test_compiled_form_takes_updated_values():
     """A function in a form that is compiled once takes the values of the next state (1e-12)."""
-    made = BlockOnBall(mesh={"n": 4})
-    made.problem.small_displacement_tolerance = np.inf
-    contact = made.contact
-    ds = ufl.ds(made.scene.mesh, subdomain_data=made.scene.tags)(BOTTOM)
+    setup = BlockOnBall(mesh={"n": 4})
+    setup.problem.small_displacement_tolerance = np.inf
+    contact = setup.contact
+    ds = ufl.ds(setup.scene.mesh, subdomain_data=setup.scene.tags)(BOTTOM)
     pressure, slip = contact.function("pressure"), contact.function("slip")
     form = compile_with_maps(pressure * ds, contact)
     assert assemble_scalar(form, COMM) == 0.0
-    for _ in fc.increments(made.problem, made.load, 0, 2, steps=4):
+    for _ in fc.increments(setup.problem, setup.load, 0, 2, steps=4):
         assert contact.function("pressure", pressure) is pressure
         contact.function("slip", into=slip)
         assert is_close(assemble_scalar(form, COMM), contact.resultants().normal_force, 1e-12)

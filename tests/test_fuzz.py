@@ -101,17 +101,17 @@ def test_body_between_two_others_is_positioned(seed):
 @serial
 def test_methods_are_tried_in_turn_on_a_refused_scene(monkeypatch):
     """The methods are tried one after another, until one has a correct solution."""
-    asked = []
+    methods = []
 
     def run_scene(scene, comm=None, **_):
         assert scene["max_iterations"]
-        asked.append(scene["method"])
+        methods.append(scene["method"])
         outcome = {"newton": "refused", "continuation": "wrong"}.get(scene["method"], "another")
         return fuzz.Outcome(outcome, "", 1, 0.0, [], {})
 
     monkeypatch.setattr(fuzz, "run_scene", run_scene)
     assert fuzz.find_solving_method({"seed": 1}) == "primal_dual"
-    assert asked == ["newton", "continuation", "primal_dual"]
+    assert methods == ["newton", "continuation", "primal_dual"]
 
 
 @serial
@@ -139,15 +139,15 @@ def test_every_method_solves_obstacle_constrained_by_pressure(method):
 @serial
 def test_most_scenes_are_solved_and_compared():
     # If all scenes were refused, or none compared, test_scenes_are_not_wrong would pass.
-    found = [(scene["seed"], solve(scene)) for scene in SCENES["scenes"][::7]]
-    solved = [(seed, o) for seed, o in found if o.outcome in ("right", "another")]
-    assert len(solved) > 0.7 * len(found)
+    computed = [(scene["seed"], solve(scene)) for scene in SCENES["scenes"][::7]]
+    solved = [(seed, o) for seed, o in computed if o.outcome in ("right", "another")]
+    assert len(solved) > 0.7 * len(computed)
     for seed, outcome in solved:
         # The first increment of two scenes is not solved independently.
-        wanted = {"equations", "nearest"} | (
+        required = {"equations", "nearest"} | (
             {"independent"} if seed not in (600094, 600209) else set()
         )
-        assert outcome.increments and wanted <= set(outcome.error_ratios), seed
+        assert outcome.increments and required <= set(outcome.error_ratios), seed
 
 
 @pytest.mark.mpi
@@ -412,12 +412,12 @@ def test_traction_that_is_not_rotated_is_detected():
 
 
 @serial
-@pytest.mark.parametrize("what", ["angle", "shift"])
-def test_wrong_obstacle_position_is_detected(what):
+@pytest.mark.parametrize("quantity", ["angle", "shift"])
+def test_wrong_obstacle_position_is_detected(quantity):
     """An obstacle that rotates or moves by 0.1 % more than prescribed is detected."""
 
     def modify(setup, problem):
-        apply, value = setup.apply, getattr(setup, what)
+        apply, value = setup.apply, getattr(setup, quantity)
 
         def more(stage, t):
             apply(stage, t)
@@ -483,7 +483,7 @@ PLATE["contacts"][0]["obstacle"] = {
 }
 
 
-def _through():
+def _tunnelling_scene():
     """Return a scene whose plate moves by 0.3 through the bottom of the block."""
     scene = copy.deepcopy(PLATE)
     scene["stages"][0]["normal"] = 300.0
@@ -508,14 +508,14 @@ def test_translated_scene_is_right(scene):
 @serial
 def test_plate_that_passes_through_a_facet_is_refused():
     assert solve(PLATE).outcome == "right"
-    assert solve(_through()).outcome == "refused"
+    assert solve(_tunnelling_scene()).outcome == "refused"
 
 
 @serial
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 def test_comparison_detects_tunnelling_of_a_plate(kinematics, monkeypatch):
     monkeypatch.setattr(TunnellingCheck, "evaluate", lambda self, before: {})
-    scene = _through()
+    scene = _tunnelling_scene()
     if kinematics == "finite":
         scene |= {"kinematics": "finite", "bulk": "linear"}
         scene["stages"][0]["turn"] = 0.0
@@ -591,13 +591,13 @@ def test_extreme_scenes_differ_in_their_bodies_only():
 def test_minimise_removes_irrelevant_features():
     scene = copy.deepcopy(ONE) | {"method": "newton", "units": [1e3, 1e-3], "weight": 0.1}
     scene["contacts"][0]["gap"] = -0.001
-    found = fuzz.minimise(scene, lambda s: "gap" in s["contacts"][0])
-    assert found["contacts"][0]["gap"] == -0.001
-    assert found["contacts"][0]["law"]["kind"] == "frictionless"
-    assert not {"method", "weight"} & set(found)
-    assert found["units"] == [1.0, 1.0]
-    assert len(found["stages"]) == 1
-    assert found["bodies"][0]["n"] == [1, 1]
+    minimised = fuzz.minimise(scene, lambda s: "gap" in s["contacts"][0])
+    assert minimised["contacts"][0]["gap"] == -0.001
+    assert minimised["contacts"][0]["law"]["kind"] == "frictionless"
+    assert not {"method", "weight"} & set(minimised)
+    assert minimised["units"] == [1.0, 1.0]
+    assert len(minimised["stages"]) == 1
+    assert minimised["bodies"][0]["n"] == [1, 1]
 
 
 @pytest.mark.slow
@@ -679,8 +679,8 @@ def test_reference_reproduces_load_history_of_a_point():
         none = np.zeros(0, dtype=int)
         load = reference.Load(push, none, np.zeros(0), [np.zeros(2)], [np.zeros(2)])
         u, motion, old = problem.solve(u, motion, load, old)
-        found = problem.evaluate(u, motion, load, old)
-        old = [problem.contacts[0].next_state(found[0], old[0])]
+        computed = problem.evaluate(u, motion, load, old)
+        old = [problem.contacts[0].next_state(computed[0], old[0])]
         assert np.allclose(u, expected, atol=1e-6)
 
 
@@ -710,10 +710,10 @@ def test_reference_passes_the_patch_test(cell, degree):
     load = loads(0, 1.0)
     none = np.zeros(problem.body.nodes_x.size)
     u, motion, old = problem.solve(none, np.zeros(0), load, [problem.contacts[0].initial_state()])
-    found = problem.evaluate(u, motion, load, old)[0]
+    computed = problem.evaluate(u, motion, load, old)[0]
     pressure = 1e-3 * 1000.0
-    assert np.allclose(-found["r_n"], pressure, rtol=1e-9)
-    assert np.allclose(found["overclosure"], pressure / 3000.0, rtol=1e-9)
+    assert np.allclose(-computed["r_n"], pressure, rtol=1e-9)
+    assert np.allclose(computed["overclosure"], pressure / 3000.0, rtol=1e-9)
     top = problem.body.nodes_x[:, -1] > 1 - 1e-9
     assert np.allclose(u.reshape(-1, d)[top, -1], -1e-3 - pressure / 3000.0, rtol=1e-9)
 

@@ -29,12 +29,12 @@ def scene(d: int) -> tuple[fc.ContactSurface, fem.Function]:
     return surface, fem.Function(displacement_space(mesh, 1))
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
+def normalise(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def half_space(x, shift, point, normal):
-    n = unit(np.asarray(normal, dtype=float))
+    n = normalise(np.asarray(normal, dtype=float))
     return (x - point - shift) @ n, np.broadcast_to(-n, x.shape)
 
 
@@ -42,22 +42,22 @@ def ball(x, shift, center, radius, inside):
     arm = x - center - shift
     distance = np.linalg.norm(arm, axis=1)
     if inside:
-        return radius - distance, unit(arm)
-    return distance - radius, -unit(arm)
+        return radius - distance, normalise(arm)
+    return distance - radius, -normalise(arm)
 
 
 def cylinder(x, shift, point, radius, inside, axis=None):
     arm = x - point - shift
     if axis is not None:
-        a = unit(np.asarray(axis, dtype=float))
+        a = normalise(np.asarray(axis, dtype=float))
         arm = arm - np.outer(arm @ a, a)
     distance = np.linalg.norm(arm, axis=1)
     if inside:
-        return radius - distance, unit(arm)
-    return distance - radius, -unit(arm)
+        return radius - distance, normalise(arm)
+    return distance - radius, -normalise(arm)
 
 
-def check(contact: fc.Contact, reference, shift=0.0) -> None:
+def check_gap_and_normal(contact: fc.Contact, reference, shift=0.0) -> None:
     """Check gap, normal and initial gap at all points of all ranks against the reference."""
     contact.evaluate()
     x = gather(COMM, contact.points)
@@ -106,13 +106,13 @@ def test_gap_and_normal(d, kind):
     make, reference = obstacles(d)[kind]
     surface, u = scene(d)
     law = fc.Frictionless(k_n=1.0)
-    check(fc.Contact(u, surface, make(None), law), reference)
+    check_gap_and_normal(fc.Contact(u, surface, make(None), law), reference)
     shift = np.array(SHIFT[d])
     moved = fc.Contact(u, surface, make(SHIFT[d]), law)
-    check(moved, reference, shift)
+    check_gap_and_normal(moved, reference, shift)
     # A displacement given by numbers is a parameter: a new value moves the obstacle.
     moved.parameters["displacement"].value[:] = -2 * shift
-    check(moved, reference, -2 * shift)
+    check_gap_and_normal(moved, reference, -2 * shift)
 
 
 @pytest.mark.each
@@ -126,7 +126,7 @@ def test_displacement_by_a_constant(d, kind):
     contact = fc.Contact(u, surface, make(motion), fc.Frictionless(k_n=1.0))
     for shift in (np.zeros(d), np.array(SHIFT[d]), -np.array(SHIFT[d])):
         motion.value[:] = shift
-        check(contact, reference, shift)
+        check_gap_and_normal(contact, reference, shift)
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -139,15 +139,15 @@ def test_obstacle_by_ufl(d):
 
     def reference(x, shift):
         columns = [0.3 * x[:, 0], *([x[:, 0] * x[:, 1]] if d == 3 else []), -4.0 - x[:, 0]]
-        n = unit(np.column_stack(columns))
+        n = normalise(np.column_stack(columns))
         return 0.1 + x[:, 0] ** 2 + n @ np.broadcast_to(shift, d), n
 
     motion = fem.Constant(surface.mesh, np.zeros(d))
     obstacle = fc.PrescribedGap(gap, normal, displacement=motion)
     contact = fc.Contact(u, surface, obstacle, fc.Frictionless(k_n=1.0))
-    check(contact, reference)
+    check_gap_and_normal(contact, reference)
     motion.value[:] = SHIFT[d]
-    check(contact, reference, np.array(SHIFT[d]))
+    check_gap_and_normal(contact, reference, np.array(SHIFT[d]))
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -158,7 +158,9 @@ def test_obstacle_by_a_function(d):
     gap.interpolate(lambda x: 0.2 + 0.5 * x[0] - 0.1 * x[1])
     obstacle = fc.PrescribedGap(gap, np.eye(d)[-1] * -3.0)
     contact = fc.Contact(u, surface, obstacle, fc.Frictionless(k_n=1.0))
-    check(contact, lambda x, s: (0.2 + 0.5 * x[:, 0] - 0.1 * x[:, 1], 0 * x - np.eye(d)[-1]))
+    check_gap_and_normal(
+        contact, lambda x, s: (0.2 + 0.5 * x[:, 0] - 0.1 * x[:, 1], 0 * x - np.eye(d)[-1])
+    )
 
 
 @pytest.mark.each
@@ -179,11 +181,11 @@ def test_prescribed_gap_does_not_depend_on_the_geometry(d, kind):
 
         return expected
 
-    check(contact, prescribed(0.07))
+    check_gap_and_normal(contact, prescribed(0.07))
     contact.parameters["gap"].value = 0.21
-    check(contact, prescribed(0.21))
+    check_gap_and_normal(contact, prescribed(0.21))
     motion.value[:] = SHIFT[d]
-    check(contact, prescribed(0.21), np.array(SHIFT[d]))
+    check_gap_and_normal(contact, prescribed(0.21), np.array(SHIFT[d]))
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -301,16 +303,16 @@ def test_only_displacement_of_an_obstacle_causes_friction():
     """Motion along Γc by ``displacement`` causes friction; by point or gap it does not."""
     force = {}
     for formulation in ("displacement", "point", "gap"):
-        made = block("quadrilateral", n=4)
-        motion, up = fem.Constant(made.mesh, np.zeros(2)), np.array([0.0, 1.0])
+        scene = block("quadrilateral", n=4)
+        motion, up = fem.Constant(scene.mesh, np.zeros(2)), np.array([0.0, 1.0])
         place = motion if formulation == "point" else np.zeros(2)
         obstacle = fc.HalfSpace(
             place, up, displacement=motion if formulation == "displacement" else None
         )
         gap = -ufl.dot(motion, ufl.as_vector(up)) if formulation == "gap" else None
-        held = [made.dirichlet_bc(TOP, i) for i in range(2)]
+        bcs = [scene.dirichlet_bc(TOP, i) for i in range(2)]
         law, contact = fc.Coulomb(0.3), {"obstacle": obstacle, "gap": gap}
-        problem, contact = made.problem(law, held, contact=contact)
+        problem, contact = scene.problem(law, bcs, contact=contact)
         motion.value[:] = 0.01, 0.01
         problem.solve()
         force[formulation] = contact.resultants().force

@@ -152,8 +152,8 @@ def test_history_equals_the_return_map_in_numpy(cell, degree):
     """
     scene = Scene(cell, degree)
     contact, law = scene.contact, scene.reference()
-    seen: set[int] = set()
-    for number, (_, _, wanted) in enumerate(PATH):
+    statuses: set[int] = set()
+    for number, (_, _, reference) in enumerate(PATH):
         field = scene.displacement(number)
         scene.u.interpolate(field)
         contact.evaluate()
@@ -166,8 +166,8 @@ def test_history_equals_the_return_map_in_numpy(cell, degree):
             assert is_close(values[name], expected[name], EXACT, scale=scale), (number, name)
         status = gather(COMM, contact.status)
         assert np.array_equal(status, expected["status"]), number
-        assert wanted <= set(status.tolist()), number
-        seen |= set(status.tolist())
+        assert reference <= set(status.tolist()), number
+        statuses |= set(status.tolist())
         # The slip is unchanged before the commit.
         assert is_close(gather(COMM, contact.slip), law.beta, EXACT, scale=1.0), number
         contact.commit()
@@ -182,7 +182,7 @@ def test_history_equals_the_return_map_in_numpy(cell, degree):
         )
         gap = expected["opening"] - expected["penetration"]
         assert is_close(gather(COMM, contact.gap), gap, EXACT, scale=0.1)
-    assert seen == {OPEN, STICK, SLIP}
+    assert statuses == {OPEN, STICK, SLIP}
     assert law.beta.min() > 0.1  # every mode of every point has slipped
 
 
@@ -313,16 +313,16 @@ def test_history_of_a_moving_obstacle(cell):
     motion = fem.Constant(mesh, np.zeros(d))
     law = fc.Coulomb(FRICTION, k_n=K_N, k_t=K_T)
     up = np.eye(d)[-1]
-    body, rest = (fem.Function(displacement_space(mesh, 1)) for _ in range(2))
+    body, obstacle_field = (fem.Function(displacement_space(mesh, 1)) for _ in range(2))
     moved = fc.Contact(body, surface, fc.HalfSpace(np.zeros(d), up), law, gap=0.1)
     pushed = fc.Contact(
-        rest, surface, fc.HalfSpace(np.zeros(d), up, displacement=motion), law, gap=0.1
+        obstacle_field, surface, fc.HalfSpace(np.zeros(d), up, displacement=motion), law, gap=0.1
     )
-    rest.interpolate(polynomial(d, 1, 3, 0.003))
+    obstacle_field.interpolate(polynomial(d, 1, 3, 0.003))
     for side, down in ((0.0, 0.15), (0.01, 0.15), (0.2, 0.16), (0.15, 0.16), (0.1, 0.0), (0, 0.14)):
         value = np.zeros(d)
         value[0], value[-1] = side, -down
-        body.x.array[:] = rest.x.array + np.tile(value, rest.x.array.size // d)
+        body.x.array[:] = obstacle_field.x.array + np.tile(value, obstacle_field.x.array.size // d)
         motion.value[:] = -value
         for contact in (moved, pushed):
             contact.commit()

@@ -19,10 +19,10 @@ NAME = "<b>one & two</b>"
 @pytest.fixture(scope="module")
 def solved_block():
     """Return a block moved back and forth, with markup as contact name, and its last step."""
-    made = BlockOnBall(contact={"name": NAME}, degree=2)
-    made.problem.small_displacement_tolerance = np.inf
-    *_, step = fc.increments(made.problem, made.load, 0, 2, steps=4, estimate=True)
-    return made, step
+    setup = BlockOnBall(contact={"name": NAME}, degree=2)
+    setup.problem.small_displacement_tolerance = np.inf
+    *_, step = fc.increments(setup.problem, setup.load, 0, 2, steps=4, estimate=True)
+    return setup, step
 
 
 def parse_table(thing):
@@ -62,23 +62,23 @@ def test_table_of_a_step(solved_block):
 
 
 @pytest.mark.parametrize(
-    ("iterations", "told"),
+    ("iterations", "expected"),
     [
         (0, "solved by the predictor"),
         (1, "1 iteration"),
         (7, "7 iterations"),
     ],
 )
-def test_iterations_of_a_step_in_words(solved_block, iterations, told):
+def test_iterations_of_a_step_in_words(solved_block, iterations, expected):
     """Summary and table state the number of iterations in the same words."""
     step = replace(solved_block[1], iterations=iterations, method="newton")
     for text in (step.summary(), parse_table(step)[2][0]):
-        assert f"newton: {told}; residual" in text
+        assert f"newton: {expected}; residual" in text
 
 
 def test_table_of_a_verdict(solved_block):
     """The table has every condition with its error and limit, and failures below."""
-    made, step = solved_block
+    setup, step = solved_block
     title, rows, remarks = parse_table(step.verdict)
     assert title == "Verdict: holds" and remarks == []
     names = [name for name, *_ in rows]
@@ -88,21 +88,21 @@ def test_table_of_a_verdict(solved_block):
     assert names[1:] == [each.name for each in step.verdict.conditions]
     for _, error, limit in rows[1:]:
         assert float(error) <= float(limit)
-    made.problem.small_displacement_tolerance = 1e-12
-    made.load(2.5)
+    setup.problem.small_displacement_tolerance = 1e-12
+    setup.load(2.5)
     with pytest.raises(fc.NotConverged) as error:
-        made.problem.solve()
-    made.problem.small_displacement_tolerance = np.inf
+        setup.problem.solve()
+    setup.problem.small_displacement_tolerance = np.inf
     title, _, remarks = parse_table(error.value.verdict)
     assert title == "Verdict: does not hold" and remarks == error.value.verdict.failures
 
 
 def test_table_of_an_error_budget(solved_block):
     """The cells are those of the text; the last row is the total of all parts."""
-    made, step = solved_block
-    scene = made.scene
+    setup, step = solved_block
+    scene = setup.scene
     tensor = stress(scene.u, scene.E, scene.nu)
-    budget = fc.estimate_errors(made.problem, tensor, increment_error=step.increment_error)
+    budget = fc.estimate_errors(setup.problem, tensor, increment_error=step.increment_error)
     title, (header, *rows), remarks = parse_table(budget)
     assert title == "Error budget" and header[1:] == list(budget.values)
     lines = str(budget).splitlines()

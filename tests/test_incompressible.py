@@ -27,7 +27,9 @@ E = 1000.0
 KINDS = ("plane strain", "axisymmetric", "3D")
 
 
-def body_of(w: fem.Function, nu: float, kind: str, isochoric: bool) -> tuple[NeoHookean, ufl.Form]:
+def mixed_body(
+    w: fem.Function, nu: float, kind: str, isochoric: bool
+) -> tuple[NeoHookean, ufl.Form]:
     """Return a body with the pressure as an unknown, and its residual."""
     (u, p), (v, q) = split(ufl.split(w)), split(ufl.TestFunctions(w.function_space))
     body = NeoHookean(u, E, nu, kind, isochoric=isochoric, pressure=p)
@@ -55,7 +57,7 @@ def test_tangent_is_the_symmetric_derivative_of_the_residual(nu, kind, isochoric
             lambda x, s=seed, a=size: a * rough_field(dimension(cell), s)(x)
         )
         function.sub(1).interpolate(lambda x, s=seed, a=size: 300 * a * np.cos(3 * x[0] + s))
-    _, F = body_of(w, nu, kind, isochoric)
+    _, F = mixed_body(w, nu, kind, isochoric)
     form, start = compile_with_maps(F), w.x.array.copy()
 
     def residual(step):
@@ -105,8 +107,8 @@ def stresses(along: float, nu: float, kind: str, isochoric: bool) -> tuple[float
     for _ in range(60):
         middle = (low + high) / 2
         low, high = (middle, high) if nominal(middle)[0][0] < 0 else (low, middle)
-    found, pressure = nominal(low)
-    return low, found[2], pressure
+    computed, pressure = nominal(low)
+    return low, computed[2], pressure
 
 
 @pytest.mark.each
@@ -126,7 +128,7 @@ def test_column_at_large_strain(nu, kind, isochoric):
     mesh, tags = block_mesh(cell, n=1 if d == 3 else 2, size=[2.0] * (d - 1) + [3.0])
     W = mixed_space(mesh, "Taylor-Hood")
     w = fem.Function(W)
-    body, F = body_of(w, nu, kind, isochoric)
+    body, F = mixed_body(w, nu, kind, isochoric)
     push = fem.Constant(mesh, 0.0)
     bcs = []
     for i in range(d):
@@ -146,14 +148,16 @@ def test_column_at_large_strain(nu, kind, isochoric):
         kinematics="finite",
     )
     problem = fc.ContactProblem(F, w, bcs=bcs, contacts=[contact])
-    for share in (0.25, 0.5, 0.75, 1.0):
-        push.value = -share
+    for factor in (0.25, 0.5, 0.75, 1.0):
+        push.value = -factor
         step = problem.solve()
         problem.commit()
     area = {"plane strain": 2.0, "axisymmetric": np.pi * 4.0, "3D": 4.0}[kind]
     assert step.contacts["contact"].normal_force == pytest.approx(-nominal * area, rel=1e-6)
-    found = w.sub(1).collapse()
-    assert is_close(owned_values(found), np.full_like(owned_values(found), pressure), 1e-6, scale=E)
+    computed = w.sub(1).collapse()
+    assert is_close(
+        owned_values(computed), np.full_like(owned_values(computed), pressure), 1e-6, scale=E
+    )
     hoop = 1.0 if kind == "plane strain" else across
     axis = 2 if d == 3 else 1
     volume = mesh.comm.allreduce(fem.assemble_scalar(fem.form(fem.Constant(mesh, 1.0) * ufl.dx)))
@@ -201,11 +205,11 @@ def test_volumetric_locking_with_and_without_pressure():
     have converged to 1e-4.
     """
     reference = force_under_a_disc(32, 0.4999, mixed="Taylor-Hood")
-    found = {
+    computed = {
         "P1": force_under_a_disc(8, 0.4999, degree=1),
         "P2": force_under_a_disc(8, 0.4999, degree=2),
     } | {name: force_under_a_disc(8, 0.4999, mixed=name) for name in MIXED}
-    errors = {name: force / reference - 1 for name, force in found.items()}
+    errors = {name: force / reference - 1 for name, force in computed.items()}
     assert errors["P1"] > 2.0
     assert 2e-3 < errors["P2"] < 6e-3
     assert abs(errors["MINI"]) < 4e-2

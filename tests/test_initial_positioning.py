@@ -27,7 +27,7 @@ FINITE = {"kinematics": "finite"}
 BULKS = {"linear": LinearElastic, "rubber": NeoHookean}
 
 
-class Hovering:
+class UnconstrainedBlock:
     """A block of size 1 constrained by contact alone, with a traction on its top."""
 
     def __init__(self, cell, bulk, traction, kind=None):
@@ -67,7 +67,7 @@ def plane(scene, gap, tilt=0.0):
     return fc.HalfSpace(scene.vector(float(tilt > 0), 0.0) - gap * normal, normal)
 
 
-def around(x, centre, radius):
+def distance_from_ball(x, centre, radius):
     """Return the distance from a ball (UFL)."""
     arm = x - ufl.as_vector(list(centre))
     return ufl.sqrt(ufl.dot(arm, arm)) - radius
@@ -82,7 +82,7 @@ def obstacle(scene, shape, gap):
     if shape == "cylinder":
         return fc.Cylinder(centre, 3.0, None if scene.d == 2 else (0.0, 1.0, 0.0))
     if shape == "distance":
-        return fc.SignedDistance(lambda x: around(x, centre, 3.0))
+        return fc.SignedDistance(lambda x: distance_from_ball(x, centre, 3.0))
     centre[-1] = 4.94 - gap
     return fc.Ball(centre, 5.0, inside=True)
 
@@ -100,16 +100,16 @@ def test_initial_gap_does_not_affect_forces(cell, shape, bulk):
     counted as slip, none of the curved cases would be solved.
     """
     tolerance = 1e-6 if shape == "plane" else 3e-2
-    found = []
+    computed = []
     for gap in (1e-4, 0.05, 1.0):
-        scene = Hovering(cell, bulk, (0.02, -1.0))
+        scene = UnconstrainedBlock(cell, bulk, (0.02, -1.0))
         contact = scene.contact(obstacle(scene, shape, gap))
         step = scene.problem(contact).solve()
         assert step.iterations <= 60
         resultants = contact.resultants()
         assert is_close(resultants.force, scene.vector(-0.02, 1.0), 1e-8)
-        found.append(resultants.tangential_force)
-    assert is_close(found[1:], found[:1] * 2, tolerance)
+        computed.append(resultants.tangential_force)
+    assert is_close(computed[1:], computed[:1] * 2, tolerance)
 
 
 @pytest.mark.parametrize("tilt", [-0.19, 0.1])
@@ -120,10 +120,10 @@ def test_rubber_block_rotates_onto_a_tilted_floor(cell, tilt):
     Reference: a flat floor and the load rotated with it, that is, the whole scene rotated: force
     and friction force, to 1e-6, which is the round-off of the rotation.
     """
-    found = []
+    computed = []
     cosine, sine = np.cos(tilt), np.sin(tilt)
     for angle in (0.0, tilt):
-        scene = Hovering(cell, "rubber", (0.1, -1.0))
+        scene = UnconstrainedBlock(cell, "rubber", (0.1, -1.0))
         if angle:
             scene.traction.value[:] = scene.vector(0.1 * cosine + sine, 0.1 * sine - cosine)
         contact = scene.contact(plane(scene, 0.3, angle))
@@ -131,8 +131,8 @@ def test_rubber_block_rotates_onto_a_tilted_floor(cell, tilt):
         assert step.iterations <= 20
         resultants = contact.resultants()
         assert is_close(resultants.force, -scene.traction.value, 1e-8)
-        found.append(resultants.tangential_force)
-    assert is_close(found[1], found[0], 1e-6)
+        computed.append(resultants.tangential_force)
+    assert is_close(computed[1], computed[0], 1e-6)
 
 
 @pytest.mark.parametrize("bulk", BULKS)
@@ -141,7 +141,7 @@ def test_two_blocks_are_positioned_on_each_other(bulk):
 
     Reference: the friction forces without gaps, to 1e-6. It takes 2 to 6 iterations.
     """
-    found = []
+    computed = []
     for low, high in ((0.0, 0.0), (0.2, 0.5), (1e-4, 1e-3)):
         body = stack("triangle", (3, 4), (1.0, 1.0), gap=high)
         if bulk == "rubber":
@@ -150,12 +150,12 @@ def test_two_blocks_are_positioned_on_each_other(bulk):
             )
         body.F -= ufl.dot(body.constant((0.05, -1.0)), body.v) * body.ds(ROOF)
         law = fc.Coulomb(friction=0.3)
-        under = body.contact(FLOOR, fc.HalfSpace((0.0, -low), (0.0, 1.0)), law, **FINITE)
-        contacts = [under, joint(body, 1, law, **FINITE)]
+        floor_contact = body.contact(FLOOR, fc.HalfSpace((0.0, -low), (0.0, 1.0)), law, **FINITE)
+        contacts = [floor_contact, joint(body, 1, law, **FINITE)]
         step = fc.ContactProblem(body.F, body.u, contacts=contacts).solve()
         assert step.iterations <= 20
-        found.append([contact.resultants().tangential_force for contact in contacts])
-    assert is_close(found[1], found[0], 1e-6) and is_close(found[2], found[0], 1e-6)
+        computed.append([contact.resultants().tangential_force for contact in contacts])
+    assert is_close(computed[1], computed[0], 1e-6) and is_close(computed[2], computed[0], 1e-6)
 
 
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
@@ -166,7 +166,7 @@ def test_block_slides_on_the_floor_until_it_reaches_the_wall(cell):
     iterations. Moved to first touch by its load, the block found no solution, and in 3D round-off
     moved it along the corner without limit.
     """
-    scene = Hovering(cell, "linear", (0.0, 0.0))
+    scene = UnconstrainedBlock(cell, "linear", (0.0, 0.0))
     v, load = ufl.TestFunction(scene.u.function_space), scene.vector(-0.6, -1.0)
     load[1:-1] = 0.05
     scene.F -= ufl.dot(fem.Constant(scene.u.function_space.mesh, load), v) * ufl.dx
@@ -184,7 +184,7 @@ def test_block_slides_on_the_floor_until_it_reaches_the_wall(cell):
 @pytest.mark.parametrize("bulk", BULKS)
 def test_axisymmetric_disc_is_positioned_on_a_ball(bulk):
     """The contact force on an axisymmetric disc is its load, π times the traction, to 1e-8."""
-    scene = Hovering("triangle", bulk, (0.0, -1.0), "axisymmetric")
+    scene = UnconstrainedBlock("triangle", bulk, (0.0, -1.0), "axisymmetric")
     scene.bcs = [dirichlet_bc(scene.u, scene.tags, LEFT, 0, 0.0)]
     contact = scene.contact(fc.Ball((0.0, -3.5), 3.0))
     step = scene.problem(contact).solve()
@@ -195,7 +195,7 @@ def test_axisymmetric_disc_is_positioned_on_a_ball(bulk):
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
 def test_restore_discards_the_positioning(enforcement):
     """`restore` discards the positioning: the history equals the one before, bit for bit."""
-    scene = Hovering("triangle", "rubber", (0.1, -1.0))
+    scene = UnconstrainedBlock("triangle", "rubber", (0.1, -1.0))
     contact = scene.contact(plane(scene, 0.5, 0.1), enforcement=enforcement)
     problem = scene.problem(contact)
     before = contact.history.rows()
@@ -222,7 +222,7 @@ def test_restore_discards_the_positioning(enforcement):
 
 def test_block_pulled_upwards_is_refused_unmoved():
     """No contact force can balance the load: it is refused, and u remains zero."""
-    scene = Hovering("triangle", "linear", (0.0, 1.0))
+    scene = UnconstrainedBlock("triangle", "linear", (0.0, 1.0))
     problem = scene.problem(scene.contact(plane(scene, 0.5)))
     with pytest.raises(ValueError, match="no contact force can balance the load"):
         problem.solve()
@@ -238,9 +238,9 @@ def test_block_is_positioned_on_a_block_that_is_in_contact(bulk, kinematics):
     Reference: the friction forces with the upper block just touching, to 1e-6. It takes 3 to 10
     iterations. When bodies were positioned only without any contact, all cases were refused.
     """
-    found = []
-    for apart in (0.0, 0.4):
-        body = stack("triangle", (3, 4), (1.0, 1.0), gap=apart)
+    computed = []
+    for gap in (0.0, 0.4):
+        body = stack("triangle", (3, 4), (1.0, 1.0), gap=gap)
         if bulk == "rubber":
             body.F = NeoHookean(body.u, 1e3, 0.3, "plane strain").residual(
                 body.v, ufl.dx(body.mesh)
@@ -251,8 +251,8 @@ def test_block_is_positioned_on_a_block_that_is_in_contact(bulk, kinematics):
         contacts = [body.contact(FLOOR, floor, law, **options), joint(body, 1, law, **options)]
         step = fc.ContactProblem(body.F, body.u, contacts=contacts).solve()
         assert step.iterations <= 20
-        found.append([contact.resultants().tangential_force for contact in contacts])
-    assert is_close(found[1], found[0], 1e-6)
+        computed.append([contact.resultants().tangential_force for contact in contacts])
+    assert is_close(computed[1], computed[0], 1e-6)
 
 
 @pytest.mark.parametrize("bulk", BULKS)
@@ -264,7 +264,7 @@ def test_released_block_keeps_its_position(gap, bulk):
     sliding under the load. It was once positioned from its initial position, 5 away, without any
     slip.
     """
-    scene = Hovering("quadrilateral", bulk, (0.0, 0.0))
+    scene = UnconstrainedBlock("quadrilateral", bulk, (0.0, 0.0))
     shift = fem.Constant(scene.u.function_space.mesh, np.zeros(2))
     floor = fc.HalfSpace((0.0, -gap), (0.0, 1.0), displacement=shift)
     contact = scene.contact(floor)
@@ -279,9 +279,9 @@ def test_released_block_keeps_its_position(gap, bulk):
         assert is_close(contact.resultants().force, [0.0, press], 1e-8, scale=1.0)
         displacements.append(contact.own_displacement()[:, 0])
     comm = scene.u.function_space.mesh.comm
-    pressed, carried, released, again = gather(comm, np.column_stack(displacements)).T
+    pressed, carried, released, reloaded = gather(comm, np.column_stack(displacements)).T
     assert is_close(carried - pressed, np.full(len(pressed), 5.0), 1e-9)
-    assert is_close(again, np.full(len(again), released.mean()), 1e-3)
+    assert is_close(reloaded, np.full(len(reloaded), released.mean()), 1e-3)
 
 
 @pytest.mark.parametrize("bulk", BULKS)
@@ -293,26 +293,26 @@ def test_obstacles_carry_unconstrained_bodies(cell, shape, bulk):
     Reference: the forces before the motion, to 1e-7. Linear bodies were refused, and on a cylinder
     all bodies.
     """
-    scene = Hovering(cell, bulk, (0.02, -1.0))
+    scene = UnconstrainedBlock(cell, bulk, (0.02, -1.0))
     shift = fem.Constant(scene.u.function_space.mesh, np.zeros(scene.d))
     centre = np.full(scene.d, 0.5)
     centre[-1] = -3.1
-    under = {
+    obstacles_below = {
         "plane": lambda: fc.HalfSpace(scene.vector(0.0, -0.1), scene.vector(0.0, 1.0), shift),
         "cylinder": lambda: fc.Cylinder(
             centre, 3.0, None if scene.d == 2 else (0.0, 1.0, 0.0), displacement=shift
         ),
     }[shape]()
-    contact = scene.contact(under)
+    contact = scene.contact(obstacles_below)
     problem = scene.problem(contact)
-    found = []
+    computed = []
     for displacement in ((0.0, 0.0), (0.3, 0.0), (0.3, -0.7)):
         shift.value[:] = scene.vector(*displacement)
         assert problem.solve().iterations <= 40
         problem.commit()
         resultants = contact.resultants()
-        found.append([*resultants.force, resultants.tangential_force])
-    assert is_close(found[1:], found[:1] * 2, 1e-7)
+        computed.append([*resultants.force, resultants.tangential_force])
+    assert is_close(computed[1:], computed[:1] * 2, 1e-7)
 
 
 @pytest.mark.parametrize("bulk", BULKS)
@@ -323,7 +323,7 @@ def test_obstacle_pushes_a_released_block(bulk):
     1e-2, as the block may touch a round obstacle elsewhere. It took 4 iterations; loaded from
     inside the obstacle, the linear block was refused.
     """
-    scene = Hovering("quadrilateral", bulk, (0.0, 0.0))
+    scene = UnconstrainedBlock("quadrilateral", bulk, (0.0, 0.0))
     shift = fem.Constant(scene.u.function_space.mesh, np.zeros(2))
     contact = scene.contact(fc.Cylinder((0.45, -3.001), 3.0, displacement=shift))
     problem = scene.problem(contact)
@@ -346,23 +346,23 @@ def test_round_off_force_after_unloading_is_not_contact():
     The slip of this point, too, is measured from the rest position. Reference: the same without
     that displacement, to 1e-5 of the forces because of the round-off.
     """
-    found = []
+    computed = []
     for displacement in (0.0, 1e5):
-        scene = Hovering("triangle", "linear", (0.0, 0.0))
+        scene = UnconstrainedBlock("triangle", "linear", (0.0, 0.0))
         mesh = scene.u.function_space.mesh
-        aside, floor = fem.Constant(mesh, 0.0), fem.Constant(mesh, np.zeros(2))
-        scene.bcs = [dirichlet_bc(scene.u, scene.tags, LEFT, 0, aside)]
+        slide, floor = fem.Constant(mesh, 0.0), fem.Constant(mesh, np.zeros(2))
+        scene.bcs = [dirichlet_bc(scene.u, scene.tags, LEFT, 0, slide)]
         half_space = fc.HalfSpace((0.0, 0.0), (0.0, 1.0), displacement=floor)
         contact = scene.contact(half_space, kinematics="small")
         problem = scene.problem(contact, small_displacement_tolerance=np.inf)
-        for up, share, beside in ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 1.0, 0.1)):
+        for up, factor, slip in ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 1.0, 0.1)):
             scene.traction.value[-1] = up
-            aside.value, floor.value[0] = share * displacement, share * displacement + beside
+            slide.value, floor.value[0] = factor * displacement, factor * displacement + slip
             problem.solve()
             problem.commit()
         resultants = contact.resultants()
-        found.append([*resultants.force, resultants.tangential_force])
-    assert is_close(found[1], found[0], 1e-5)
+        computed.append([*resultants.force, resultants.tangential_force])
+    assert is_close(computed[1], computed[0], 1e-5)
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
@@ -375,30 +375,30 @@ def test_slip_of_a_positioned_block_is_relative_to_the_floor(first, slope, kinem
     release. Reference: the same without the common displacement, to 1e-6: the round-off of K u,
     4e-9, changes the position of a carried block.
     """
-    found = {}
+    computed = {}
     for both in (0.0, -4.0):
         for of_block in (0.003, 0.0):
-            scene = Hovering("triangle", "linear", (0.0, 0.0))
+            scene = UnconstrainedBlock("triangle", "linear", (0.0, 0.0))
             mesh = scene.u.function_space.mesh
-            lead, shift = fem.Constant(mesh, 0.0), fem.Constant(mesh, np.zeros(2))
+            displacement, shift = fem.Constant(mesh, 0.0), fem.Constant(mesh, np.zeros(2))
             V = scene.u.function_space.sub(0)
             left = fem.locate_dofs_topological(V, 1, scene.tags.find(LEFT))
-            scene.bcs = [fem.dirichletbc(lead, left, V)]
+            scene.bcs = [fem.dirichletbc(displacement, left, V)]
             floor = fc.HalfSpace((0.0, -0.3), (-slope, 1.0), shift)
             contact = scene.contact(floor, kinematics=kinematics)
             problem = scene.problem(contact)
             for press in (1.0,) if first else (1.0, 0.0, 1.0):
                 scene.traction.value[:] = (0.0, -press)
                 if problem.increment == (0 if first else 2):
-                    lead.value = both + of_block
+                    displacement.value = both + of_block
                     shift.value[:] = (both + of_block - 0.003, 0.0)
                 problem.solve()
                 problem.commit()
             resultants = contact.resultants()
-            found[both, of_block] = [*resultants.force, resultants.tangential_force]
-    reference = found.pop((0.0, 0.003))
+            computed[both, of_block] = [*resultants.force, resultants.tangential_force]
+    reference = computed.pop((0.0, 0.003))
     assert abs(reference[2]) > 0.05
-    for forces in found.values():
+    for forces in computed.values():
         assert is_close(forces, reference, 1e-6)
 
 
@@ -409,9 +409,9 @@ def test_raised_floor_causes_no_slip(bulk, kinematics):
 
     Nothing slips after first touch. Reference: the floor at rest, to 1e-6 of the forces.
     """
-    found = []
+    computed = []
     for up in (0.0, 0.2, 0.5):
-        scene = Hovering("triangle", bulk, (0.0, -1.0))
+        scene = UnconstrainedBlock("triangle", bulk, (0.0, -1.0))
         mesh = scene.u.function_space.mesh
         scene.bcs = [dirichlet_bc(scene.u, scene.tags, side, 0) for side in (LEFT, RIGHT)]
         shift = fem.Constant(mesh, np.array([0.0, up]))
@@ -419,8 +419,8 @@ def test_raised_floor_causes_no_slip(bulk, kinematics):
         contact = scene.contact(floor, friction=0.2, kinematics=kinematics)
         scene.problem(contact, small_displacement_tolerance=np.inf).solve()
         resultants = contact.resultants()
-        found.append([*resultants.force, resultants.tangential_force])
-    assert is_close(found[1:], found[:1] * 2, 1e-6)
+        computed.append([*resultants.force, resultants.tangential_force])
+    assert is_close(computed[1:], computed[:1] * 2, 1e-6)
 
 
 @pytest.mark.parametrize("bulk", BULKS)
@@ -430,9 +430,9 @@ def test_floor_rotates_while_a_block_is_positioned(bulk):
     Reference: floor and axis 0.3 higher, to 1e-6: the slip of the block is the motion of the floor
     during their contact.
     """
-    found = []
+    computed = []
     for gap in (1e-9, 0.3):
-        scene = Hovering("triangle", bulk, (0.0, -1.0))
+        scene = UnconstrainedBlock("triangle", bulk, (0.0, -1.0))
         mesh = scene.u.function_space.mesh
         scene.bcs = [dirichlet_bc(scene.u, scene.tags, side, 0) for side in (LEFT, RIGHT)]
         angle = fem.Constant(mesh, 4e-6)  # the points stick
@@ -440,9 +440,9 @@ def test_floor_rotates_while_a_block_is_positioned(bulk):
         contact = scene.contact(floor, friction=1.0)
         scene.problem(contact).solve()
         resultants = contact.resultants()
-        found.append([*resultants.force, resultants.tangential_force])
-    assert abs(found[0][2]) > 0.01
-    assert is_close(found[1], found[0], 1e-6)
+        computed.append([*resultants.force, resultants.tangential_force])
+    assert abs(computed[0][2]) > 0.01
+    assert is_close(computed[1], computed[0], 1e-6)
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
@@ -453,24 +453,24 @@ def test_floor_carries_a_block_while_it_is_positioned(gap, bulk, kinematics):
 
     Reference: the floor at rest, moved by the floor's displacement, to 1e-6.
     """
-    found = []
+    computed = []
     for along in (0.0, 0.1):
-        scene = Hovering("quadrilateral", bulk, (0.0, -1.0))
+        scene = UnconstrainedBlock("quadrilateral", bulk, (0.0, -1.0))
         shift = fem.Constant(scene.u.function_space.mesh, np.array([along, 0.0]))
         floor = fc.HalfSpace((0.0, -gap), (0.0, 1.0), shift)
         contact = scene.contact(floor, kinematics=kinematics)
         scene.problem(contact, small_displacement_tolerance=np.inf).solve()
         comm = scene.u.function_space.mesh.comm
         place = gather(comm, contact.own_displacement())[:, 0].mean() - along
-        found.append([place, contact.resultants().tangential_force])
-    assert found[0][1] > 0.1
-    assert is_close(found[1], found[0], 1e-6)
+        computed.append([place, contact.resultants().tangential_force])
+    assert computed[0][1] > 0.1
+    assert is_close(computed[1], computed[0], 1e-6)
 
 
 @pytest.mark.each
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
 @pytest.mark.parametrize("bulk", ["linear", "rubber"])
-@pytest.mark.parametrize("other", ["hovering", "led"])
+@pytest.mark.parametrize("other", ["hovering", "driven"])
 def test_carried_block_does_not_depend_on_another_block(other, bulk, kinematics):
     """Friction alone carries a block by twenty times its deformation, with or without another.
 
@@ -480,12 +480,12 @@ def test_carried_block_does_not_depend_on_another_block(other, bulk, kinematics)
     one measure it took 1068, and was refused.
     """
     places, counts = [], []
-    for beside in (False, True):
+    for with_other_body in (False, True):
         boxes = {"carried": Box()}
-        if beside:
+        if with_other_body:
             boxes["other"] = Box(low=(3.0, 0.1 if other == "hovering" else 0.0))
         scene = SceneWithUnrelatedBodies(boxes, rubber=bulk == "rubber")
-        down, lead = scene.bodies.constant(-0.01), scene.bodies.constant()
+        down, displacement = scene.bodies.constant(-0.01), scene.bodies.constant()
         scene.load("carried", TOP, 1, down)
         shift = fem.Constant(scene.bodies.u.function_space.mesh, np.zeros(2))
         floor, law = fc.HalfSpace((0, 0), (0, 1), shift), fc.Coulomb(0.3)
@@ -493,13 +493,13 @@ def test_carried_block_does_not_depend_on_another_block(other, bulk, kinematics)
             scene.contact(name, BOTTOM, floor, law, kinematics=kinematics, name=name)
             for name in boxes
         ]
-        if beside and other == "led":
-            scene.prescribe("other", LEFT, 0, value=lead)
+        if with_other_body and other == "driven":
+            scene.prescribe("other", LEFT, 0, value=displacement)
             scene.load("other", TOP, 1, down)
         problem = scene.problem(*contacts, small_displacement_tolerance=np.inf)
         counts.append([])
-        for share in (0.0, 1.0, 2.0):
-            shift.value[0], lead.value = 0.02 * share, 0.01 * share
+        for factor in (0.0, 1.0, 2.0):
+            shift.value[0], displacement.value = 0.02 * factor, 0.01 * factor
             counts[-1].append(problem.solve().iterations)
             problem.commit()
         comm = scene.bodies.u.function_space.mesh.comm
@@ -517,8 +517,8 @@ def test_positioned_block_does_not_depend_on_a_carried_block(kinematics):
     taken as its start.
     """
     places = []
-    for beside in (False, True):
-        boxes = {"hovering": Box(low=(3.0, 0.1))} | ({"carried": Box()} if beside else {})
+    for with_other_body in (False, True):
+        boxes = {"hovering": Box(low=(3.0, 0.1))} | ({"carried": Box()} if with_other_body else {})
         scene = SceneWithUnrelatedBodies(boxes)
         loads = {name: scene.bodies.constant() for name in boxes}
         for name, load in loads.items():
@@ -533,7 +533,7 @@ def test_positioned_block_does_not_depend_on_a_carried_block(kinematics):
         for number in range(4):
             shift.value[0] = 0.02 * number
             loads["hovering"].value = -0.01 if number > 1 else 0.0
-            if beside:
+            if with_other_body:
                 loads["carried"].value = -0.01
             problem.solve()
             problem.commit()
@@ -546,12 +546,14 @@ def test_unloaded_block_keeps_its_position_until_it_is_pushed():
 
     Reference: its position before, to 1e-12. The linear programme left it undetermined, 1e7 away.
     """
-    scene = SceneWithUnrelatedBodies({"pressed": Box(), "beside": Box(low=(1.01, 0.0))})
+    scene = SceneWithUnrelatedBodies({"pressed": Box(), "neighbour": Box(low=(1.01, 0.0))})
     scene.load("pressed", TOP, 1, scene.bodies.constant(-0.01))
     scene.prescribe("pressed", LEFT, 0)
     floor, law = fc.HalfSpace((0, 0), (0, 1)), fc.Coulomb(0.3)
-    contacts = [scene.contact(box, BOTTOM, floor, law, name=box) for box in ("pressed", "beside")]
-    side = scene.contact("pressed", RIGHT, ("beside", LEFT), fc.Frictionless(), name="side")
+    contacts = [
+        scene.contact(box, BOTTOM, floor, law, name=box) for box in ("pressed", "neighbour")
+    ]
+    side = scene.contact("pressed", RIGHT, ("neighbour", LEFT), fc.Frictionless(), name="side")
     scene.problem(*contacts, side).solve()
     assert np.abs(contacts[1].own_displacement()).max(initial=0.0) < 1e-12
 
@@ -577,8 +579,10 @@ def test_vertical_load_does_not_move_a_block_sideways(kinematics, n_steps, n_wal
     for side, x, wall in zip((LEFT, RIGHT), (0.0, 1.0), walls, strict=False):
         obstacles[side] = fc.HalfSpace((x, 0), (1 - 2 * x, 0), displacement=wall)
     contacts = [
-        scene.contact("block", side, what, fc.Coulomb(0.5), name=f"{side}", kinematics=kinematics)
-        for side, what in obstacles.items()
+        scene.contact(
+            "block", side, obstacle, fc.Coulomb(0.5), name=f"{side}", kinematics=kinematics
+        )
+        for side, obstacle in obstacles.items()
     ]
     problem = scene.problem(*contacts, small_displacement_tolerance=np.inf)
 

@@ -111,21 +111,21 @@ def test_mesh_too_far_from_the_origin_is_refused(offset):
         assert call().contacts["contact"].normal_force == pytest.approx(1.0, rel=1e-8)
 
 
-@pytest.mark.parametrize("what", ["load", "modulus"])
-def test_function_that_is_nan_on_one_rank_is_refused(what):
+@pytest.mark.parametrize("name", ["load", "modulus"])
+def test_function_that_is_nan_on_one_rank_is_refused(name):
     """A coefficient function with NaN in cells of one rank is named on all ranks."""
     scene = pressed_block()
-    field = fem.Function(fem.functionspace(scene.mesh, ("DG", 0)), name=f"the {what}")
+    field = fem.Function(fem.functionspace(scene.mesh, ("DG", 0)), name=f"the {name}")
     field.x.array[:] = 1.0
     centers = field.function_space.tabulate_dof_coordinates()
     field.x.array[(centers[:, 0] > 0.5) & (centers[:, 1] > 0.75)] = np.nan
     v = ufl.TestFunction(scene.u.function_space)
     dx = ufl.dx(scene.mesh)
-    if what == "load":
+    if name == "load":
         scene.F -= field * v[1] * dx
     else:
         scene.F += ufl.inner(field * strain(scene.u), strain(v)) * dx
-    assert_raised_on_all_ranks(make_solve(scene), ValueError, f"the {what}", "finite")
+    assert_raised_on_all_ranks(make_solve(scene), ValueError, f"the {name}", "finite")
 
 
 @pytest.mark.whole
@@ -137,11 +137,11 @@ def test_dirichlet_value_that_is_not_finite_is_refused(kind, value):
     if kind == "constant":
         bc = scene.dirichlet_bc(TOP, 1, value)
     else:
-        given = fem.Function(scene.u.function_space)
+        prescribed = fem.Function(scene.u.function_space)
         x = scene.u.function_space.tabulate_dof_coordinates()
         corner = np.flatnonzero(np.isclose(x[:, 0], 1.0) & np.isclose(x[:, 1], 1.0))
-        given.x.array[2 * corner] = value
-        bc = fem.dirichletbc(given, scene.facet_dofs(TOP))
+        prescribed.x.array[2 * corner] = value
+        bc = fem.dirichletbc(prescribed, scene.facet_dofs(TOP))
     assert_raised_on_all_ranks(
         make_solve(scene, bcs=[*scene.rollers(), bc]), ValueError, "Dirichlet", "finite"
     )
@@ -234,8 +234,8 @@ def test_load_away_from_the_obstacle_is_refused(cell):
     assert_raised_on_all_ranks(make_solve(scene, bcs=[]), ValueError, "balance")
     # With the normal displacement of the top prescribed elasticity balances the load.
     scene = block(cell, up=1.0)
-    held = [*scene.rollers(), scene.dirichlet_bc(TOP, scene.dim - 1)]
-    step = make_solve(scene, bcs=held)()
+    bcs = [*scene.rollers(), scene.dirichlet_bc(TOP, scene.dim - 1)]
+    step = make_solve(scene, bcs=bcs)()
     assert step.contacts["contact"].normal_force <= 1e-8
 
 
@@ -290,8 +290,8 @@ def test_load_above_the_friction_limit_is_refused(cell):
     problem, _ = scene.problem(coulomb_law(0.3), [])
     assert_raised_on_all_ranks(problem.solve, ValueError, "balance", "translation along x")
     # More friction balances the load; its moment does not tip the block (0.35 < 0.5).
-    held, _ = scene.problem(coulomb_law(0.5), [])
-    step = held.solve()
+    below_limit, _ = scene.problem(coulomb_law(0.5), [])
+    step = below_limit.solve()
     resultants = step.contacts["contact"]
     # Equilibrium; 1e-7 is a hundred times the solver's tolerance on forces.
     assert resultants.force == pytest.approx(-scene.vector(side=0.35, up=-1.0), abs=1e-7)
@@ -326,8 +326,10 @@ def test_load_and_friction_limit_are_stated(cell):
     words = ["balance", "translation along x", "at most 0.6"]
     for over in (1.01, 1.08):
         scene = block(cell, up=-pressure, side=over * friction * pressure)
-        told = [*words, f"{over * friction * pressure:.6g}"]
-        assert_raised_on_all_ranks(make_solve(scene, coulomb_law(friction), []), ValueError, *told)
+        expected = [*words, f"{over * friction * pressure:.6g}"]
+        assert_raised_on_all_ranks(
+            make_solve(scene, coulomb_law(friction), []), ValueError, *expected
+        )
     scene = block(cell, up=-pressure, side=0.99 * friction * pressure)
     assert make_solve(scene, coulomb_law(friction), [])().verdict.failures == []
 

@@ -111,8 +111,8 @@ def test_wrong_uses_of_mixed_elements_are_refused():
     scalars = fem.Function(fem.functionspace(scene.mesh, basix.ufl.mixed_element([line, line])))
     split = "u, p = ufl.split(w)"
     u, p = ufl.split(both)
-    for whole in (both, scalars):
-        assert_raised_on_all_ranks(contact_with(whole, scene), ValueError, "a mixed element", split)
+    for mixed in (both, scalars):
+        assert_raised_on_all_ranks(contact_with(mixed, scene), ValueError, "a mixed element", split)
     assert_raised_on_all_ranks(contact_with(both.sub(0), scene), ValueError, "w.sub(i)", split)
     for none in (2 * u, u + scene.u, ufl.as_vector([both[1], both[0]])):
         assert_raised_on_all_ranks(contact_with(none, scene), ValueError, "u is a", split)
@@ -294,15 +294,15 @@ def test_parameters_of_obstacles_must_be_numbers():
     )
 
 
-@pytest.mark.parametrize("held", [True, False])
-def test_reversed_obstacle_is_refused_or_warned_of(held, caplog):
+@pytest.mark.parametrize("constrained", [True, False])
+def test_reversed_obstacle_is_refused_or_warned_of(constrained, caplog):
     """The normal of a floor points down, or a ball is solid that should surround the body.
 
     If the body is inside the obstacle, it is refused. If a reversed floor just touches the
     body, there is a warning.
     """
     scene = pressed_block()
-    bcs = [*scene.rollers(), scene.dirichlet_bc(TOP, 1)] if held else scene.rollers()
+    bcs = [*scene.rollers(), scene.dirichlet_bc(TOP, 1)] if constrained else scene.rollers()
     for obstacle in (fc.HalfSpace((0, -0.5), (0, -1)), fc.Ball((0.5, 0.5), 2.0)):
         assert_raised_on_all_ranks(
             lambda s=obstacle: scene.problem(coulomb_law(), bcs, contact={"obstacle": s}),

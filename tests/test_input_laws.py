@@ -350,9 +350,14 @@ def test_normal_of_length_zero_on_half_of_the_surface(obstacle):
     scene = pressed_block()
     x = ufl.SpatialCoordinate(scene.mesh)
     normal = ufl.as_vector([0, ufl.conditional(ufl.gt(x[0], 0.5), -1.0, 0.0)])
-    made = {"obstacle": fc.PrescribedGap(0.0, normal), "half-space": fc.HalfSpace((0, 0), -normal)}
+    obstacles_by_kind = {
+        "obstacle": fc.PrescribedGap(0.0, normal),
+        "half-space": fc.HalfSpace((0, 0), -normal),
+    }
     assert_raised_on_all_ranks(
-        lambda: scene.problem(coulomb_law(), scene.rollers(), contact={"obstacle": made[obstacle]}),
+        lambda: scene.problem(
+            coulomb_law(), scene.rollers(), contact={"obstacle": obstacles_by_kind[obstacle]}
+        ),
         ValueError,
         "normal",
         "length",
@@ -421,8 +426,8 @@ def test_modulus_function_out_of_range(value):
 
 
 @pytest.mark.whole
-@pytest.mark.parametrize("what", ["friction", "gap", "weight", "displacement", "normal"])
-def test_data_that_depend_on_the_displacement(what):
+@pytest.mark.parametrize("parameter", ["friction", "gap", "weight", "displacement", "normal"])
+def test_data_that_depend_on_the_displacement(parameter):
     """Data of the contact that depend on the unknown u are refused by name."""
     scene = pressed_block()
     part = scene.u.sub(1)  # has the same array as u
@@ -433,10 +438,10 @@ def test_data_that_depend_on_the_displacement(what):
         "weight": {"weight": 1 + grows},
         "displacement": {"displacement": ufl.as_vector([0.0, 0.1 * scene.u[1]])},
         "normal": {"obstacle": fc.PrescribedGap(0.0, ufl.as_vector([scene.u[0], -1.0]))},
-    }[what]
-    law = coulomb_law(friction=grows if what == "friction" else 0.3)
+    }[parameter]
+    law = coulomb_law(friction=grows if parameter == "friction" else 0.3)
     assert_raised_on_all_ranks(
-        lambda: scene.contact(law, **contact), ValueError, what, "the unknown", "u"
+        lambda: scene.contact(law, **contact), ValueError, parameter, "the unknown", "u"
     )
 
 
@@ -454,26 +459,26 @@ def test_data_of_another_mesh_or_form():
 DATA = ["friction", "gap", "weight"]
 
 
-def with_data(scene, what, value):
+def with_data(scene, parameter, value):
     """Return a contact with one of its data set to a value."""
-    contact = {} if what == "friction" else {what: value}
-    return scene.contact(coulomb_law(friction=value if what == "friction" else 0.3), **contact)
+    contact = {} if parameter == "friction" else {parameter: value}
+    return scene.contact(coulomb_law(friction=value if parameter == "friction" else 0.3), **contact)
 
 
 @pytest.mark.whole
-@pytest.mark.parametrize("what", DATA)
-def test_data_in_single_precision(what):
+@pytest.mark.parametrize("parameter", DATA)
+def test_data_in_single_precision(parameter):
     """A constant of np.float32 is refused, as forms are in double precision."""
     scene = pressed_block()
     value = fem.Constant(scene.mesh, np.float32(0.3))
     assert_raised_on_all_ranks(
-        lambda: with_data(scene, what, value), ValueError, what, "float32", "double"
+        lambda: with_data(scene, parameter, value), ValueError, parameter, "float32", "double"
     )
 
 
 @pytest.mark.whole
-@pytest.mark.parametrize("what", DATA)
-def test_data_on_quadrature_elements(what):
+@pytest.mark.parametrize("parameter", DATA)
+def test_data_on_quadrature_elements(parameter):
     """Values at quadrature points of cells, or of another rule on Γc, are refused.
 
     Values at the points of the contact's own rule give the force of the same number, to 1e-12.
@@ -488,11 +493,11 @@ def test_data_on_quadrature_elements(what):
 
     facets = scene.surface.submesh
     for value in (at_points(scene.mesh, "quadrilateral", 2), at_points(facets, "interval", 4)):
-        refused = ValueError, what, "quadrature element", "DG"
-        assert_raised_on_all_ranks(lambda value=value: with_data(scene, what, value), *refused)
+        refused = ValueError, parameter, "quadrature element", "DG"
+        assert_raised_on_all_ranks(lambda value=value: with_data(scene, parameter, value), *refused)
     forces = []
     for value in (at_points(facets, "interval", 2), 0.2):
-        contact = with_data(scene, what, value)
+        contact = with_data(scene, parameter, value)
         problem = fc.ContactProblem(scene.F, scene.u, bcs=scene.rollers(), contacts=[contact])
         problem.solve()
         forces.append(contact.resultants().force)
@@ -501,10 +506,10 @@ def test_data_on_quadrature_elements(what):
 
 
 @pytest.mark.whole
-@pytest.mark.parametrize("what", DATA)
-def test_data_that_cannot_be_compiled(what):
+@pytest.mark.parametrize("parameter", DATA)
+def test_data_that_cannot_be_compiled(parameter):
     """An expression that FFCx cannot compile, the area of a facet, is refused by name."""
     scene = pressed_block()
     value = 0.1 * ufl.FacetArea(scene.mesh)
-    words = what, "cannot be compiled", "FacetArea", "fem.Function"
-    assert_raised_on_all_ranks(lambda: with_data(scene, what, value), ValueError, *words)
+    words = parameter, "cannot be compiled", "FacetArea", "fem.Function"
+    assert_raised_on_all_ranks(lambda: with_data(scene, parameter, value), ValueError, *words)

@@ -31,45 +31,50 @@ EXACT = 1e-12
 LOWER_HALF, REST = 7, 3
 
 
-def only(mesh: dolfinx.mesh.Mesh, tags: dolfinx.mesh.MeshTags, tag: Any) -> dict[str, Any]:
+def measure_arguments(
+    mesh: dolfinx.mesh.Mesh, tags: dolfinx.mesh.MeshTags, tag: Any
+) -> dict[str, Any]:
     """Return measure arguments for one or several tags, renumbered to 1 so that forms are equal."""
-    mine = tags.indices[np.isin(tags.values, tag)]
-    ones = dolfinx.mesh.meshtags(mesh, tags.dim, mine, np.ones(len(mine), dtype=np.int32))
+    selected = tags.indices[np.isin(tags.values, tag)]
+    ones = dolfinx.mesh.meshtags(mesh, tags.dim, selected, np.ones(len(selected), dtype=np.int32))
     return {"subdomain_data": ones, "subdomain_id": 1}
 
 
 def measure(mesh: dolfinx.mesh.Mesh, tags: dolfinx.mesh.MeshTags, tag: Any) -> float:
     """Return the length, area or volume of the entities with a tag."""
     kind = "dx" if tags.dim == mesh.topology.dim else "ds"
-    return total(fem.Constant(mesh, 1.0) * ufl.Measure(kind, domain=mesh, **only(mesh, tags, tag)))
+    return integrate(
+        fem.Constant(mesh, 1.0)
+        * ufl.Measure(kind, domain=mesh, **measure_arguments(mesh, tags, tag))
+    )
 
 
-def total(form: ufl.Form) -> float:
+def integrate(form: ufl.Form) -> float:
     """Return the integral of a form over all ranks."""
     return COMM.allreduce(fem.assemble_scalar(fem.form(form)))
 
 
 def volume(mesh: dolfinx.mesh.Mesh) -> float:
     """Return the volume of all cells."""
-    return total(fem.Constant(mesh, 1.0) * ufl.dx)
+    return integrate(fem.Constant(mesh, 1.0) * ufl.dx)
 
 
 def centre(mesh: dolfinx.mesh.Mesh, tags: dolfinx.mesh.MeshTags, tag: Any) -> np.ndarray:
     """Return the integral of the coordinates over the cells with a tag."""
     x = ufl.SpatialCoordinate(mesh)
-    dx = ufl.Measure("dx", domain=mesh, **only(mesh, tags, tag))
-    return np.array([total(x[i] * dx) for i in range(mesh.geometry.dim)])
+    dx = ufl.Measure("dx", domain=mesh, **measure_arguments(mesh, tags, tag))
+    return np.array([integrate(x[i] * dx) for i in range(mesh.geometry.dim)])
 
 
 def lower_half(mesh: dolfinx.mesh.Mesh, *, all_cells: bool = True) -> dolfinx.mesh.MeshTags:
     """Tag cells with a low midpoint as LOWER_HALF, and the others as REST or not at all."""
     d = mesh.topology.dim
     cells = mesh.topology.index_map(d)
-    every = np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
-    middle = dolfinx.mesh.compute_midpoints(mesh, d, every).reshape(-1, 3)[:, d - 1]
+    cell_indices = np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
+    middle = dolfinx.mesh.compute_midpoints(mesh, d, cell_indices).reshape(-1, 3)[:, d - 1]
     values = np.where(middle < 0.45, LOWER_HALF, REST).astype(np.int32)
-    kept = all_cells | (values == LOWER_HALF)
-    return dolfinx.mesh.meshtags(mesh, d, every[kept], values[kept])
+    selected = all_cells | (values == LOWER_HALF)
+    return dolfinx.mesh.meshtags(mesh, d, cell_indices[selected], values[selected])
 
 
 def bend(x: np.ndarray) -> np.ndarray:
@@ -98,29 +103,29 @@ def test_measures_by_tag_agree_with_those_of_the_parts(
     d = dimension(cell)
     assert joined.bodies == ("coarse", "fine")
     assert joined.mesh.topology.index_map(d).num_ghosts == 0
-    for what, numbers in (
+    for kind, numbers in (
         (joined.cells, joined.cell_numbers),
         (joined.facets, joined.facet_numbers),
     ):
-        given = [number for body in joined.bodies for number in numbers[body].values()]
-        assert given == list(range(1, len(given) + 1))
-        present = np.unique(np.concatenate(COMM.allgather(what.values)))
-        assert present.tolist() == given
+        tags_of_parts = [number for body in joined.bodies for number in numbers[body].values()]
+        assert tags_of_parts == list(range(1, len(tags_of_parts) + 1))
+        present = np.unique(np.concatenate(COMM.allgather(kind.values)))
+        assert present.tolist() == tags_of_parts
     for name, (mesh, halves, sides) in parts.items():
         for tag in (LOWER_HALF, REST) if name == "fine" else (LOWER_HALF,):
             new = joined.cell(name, tag)
             expected = measure(mesh, halves, tag)
             assert measure(joined.mesh, joined.cells, new) == pytest.approx(expected, rel=EXACT)
-            found = centre(joined.mesh, joined.cells, new)
-            assert found == pytest.approx(centre(mesh, halves, tag), rel=EXACT)
+            computed = centre(joined.mesh, joined.cells, new)
+            assert computed == pytest.approx(centre(mesh, halves, tag), rel=EXACT)
         for tag in (BOTTOM, TOP, LEFT):
             expected = measure(mesh, sides, tag)
-            found = measure(joined.mesh, joined.facets, joined.facet(name, tag))
-            assert found == pytest.approx(expected, rel=EXACT)
-        whole = volume(mesh)
-        assert whole > 1 if curved else whole == pytest.approx(1)
-        found = measure(joined.mesh, joined.cells, joined.body(name))
-        assert found == pytest.approx(whole, rel=EXACT)
+            computed = measure(joined.mesh, joined.facets, joined.facet(name, tag))
+            assert computed == pytest.approx(expected, rel=EXACT)
+        total = volume(mesh)
+        assert total > 1 if curved else total == pytest.approx(1)
+        computed = measure(joined.mesh, joined.cells, joined.body(name))
+        assert computed == pytest.approx(total, rel=EXACT)
 
 
 @pytest.mark.parametrize("cell", CELLS)
@@ -149,12 +154,12 @@ def test_interior_facets_keep_their_tag(cell: str) -> None:
     other, sides = block_mesh(cell, n=3)
     joined = fc.join_meshes([(other, None, sides), (mesh, None, tags)])
     new = joined.facet(1, 5)
-    mine = joined.facets.find(new)
+    tagged = joined.facets.find(new)
     n_owned = joined.mesh.topology.index_map(1).size_local
-    assert COMM.allreduce(np.count_nonzero(mine < n_owned)) == 4
+    assert COMM.allreduce(np.count_nonzero(tagged < n_owned)) == 4
     # Every rank that has such a facet knows its tag.
-    found = dolfinx.mesh.locate_entities(joined.mesh, 1, lambda x: np.isclose(x[1], 0.5))
-    assert np.all(COMM.allgather(np.array_equal(np.sort(mine), np.sort(found))))
+    interior_facets = dolfinx.mesh.locate_entities(joined.mesh, 1, lambda x: np.isclose(x[1], 0.5))
+    assert np.all(COMM.allgather(np.array_equal(np.sort(tagged), np.sort(interior_facets))))
 
 
 def test_cubic_geometry_keeps_its_volume() -> None:
@@ -170,8 +175,8 @@ def test_cubic_geometry_keeps_its_volume() -> None:
     one = volume(mesh)
     joined = fc.join_meshes([mesh, mesh])
     for i in (0, 1):
-        found = measure(joined.mesh, joined.cells, joined.body(i))
-        assert found == pytest.approx(one, rel=EXACT)
+        computed = measure(joined.mesh, joined.cells, joined.body(i))
+        assert computed == pytest.approx(one, rel=EXACT)
     assert one == pytest.approx(1.075)
 
 
@@ -181,7 +186,7 @@ def test_values_by_body() -> None:
     joined = fc.join_meshes(meshes)
     assert joined.bodies == (0, 1)
     field = joined.by_body({0: 5.0, 1: 7.0})
-    assert total(field * ufl.dx) == pytest.approx(5 * 1 + 7 * 2)
+    assert integrate(field * ufl.dx) == pytest.approx(5 * 1 + 7 * 2)
     for values, words in (
         ({0: 5.0}, ["[0]", "[0, 1]"]),
         (5.0, ["5.0", "dict"]),
@@ -245,8 +250,8 @@ def test_incompatible_meshes_are_refused(other: Any, words: list[str]) -> None:
 @pytest.mark.skipif(COMM.size == 1, reason="one rank is all ranks")
 def test_meshes_of_another_communicator_are_refused() -> None:
     """A mesh of one rank alone cannot be joined with a mesh of all ranks."""
-    own = dolfinx.mesh.create_unit_square(MPI.COMM_SELF, 1, 1, CellType.triangle)
-    parts = [block_mesh("triangle")[0], own]
+    serial_mesh = dolfinx.mesh.create_unit_square(MPI.COMM_SELF, 1, 1, CellType.triangle)
+    parts = [block_mesh("triangle")[0], serial_mesh]
     words = f"{COMM.size} ranks", "on 1", "communicator"
     assert_raised_on_all_ranks(lambda: fc.join_meshes(parts), ValueError, *words)
 
@@ -255,8 +260,8 @@ def test_wrong_parts_are_refused() -> None:
     """The error names the given argument and the expected one."""
     mesh, sides = block_mesh("triangle")
     cells = mesh.topology.index_map(2)
-    every = np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
-    halves = dolfinx.mesh.meshtags(mesh, 2, every, np.full(len(every), 0.5))
+    cell_indices = np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
+    halves = dolfinx.mesh.meshtags(mesh, 2, cell_indices, np.full(len(cell_indices), 0.5))
     other, far = block_mesh("triangle", n=20)[0], None
     n = other.topology.index_map(1)
     last = np.array([n.size_local + n.num_ghosts - 1], dtype=np.int32)
@@ -280,7 +285,7 @@ def test_meshes_with_different_node_variants_are_refused() -> None:
     """Nodes of degree 3 depend on the variant: the meshes are refused, the nodes not moved."""
     x, cells = np.array([[0.0, 0], [1, 0], [0, 1]]), np.array([[0, 1, 2]])
     serial = create_mesh("triangle", x, cells, comm=MPI.COMM_SELF)
-    made = []
+    meshes = []
     for variant in (basix.LagrangeVariant.gll_warped, basix.LagrangeVariant.equispaced):
         element = basix.ufl.element("Lagrange", "triangle", 3, lagrange_variant=variant)
         space = fem.functionspace(serial, element)
@@ -288,9 +293,11 @@ def test_meshes_with_different_node_variants_are_refused() -> None:
         if COMM.rank:
             nodes, list_ = nodes[:0], list_[:0]
         vector = basix.ufl.blocked_element(element, shape=(2,))
-        made.append(
+        meshes.append(
             dolfinx.mesh.create_mesh(
                 COMM, cells=list_.astype(np.int64), x=nodes, e=ufl.Mesh(vector)
             )
         )
-    assert_raised_on_all_ranks(lambda: fc.join_meshes(made), ValueError, "gll_warped", "equispaced")
+    assert_raised_on_all_ranks(
+        lambda: fc.join_meshes(meshes), ValueError, "gll_warped", "equispaced"
+    )

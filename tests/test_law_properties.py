@@ -125,12 +125,12 @@ class Point:
 @functools.cache
 def point(name: str, d: int) -> Point:
     """Return the law of this name; ranks compile it one after another, as they share a cache."""
-    made = None
+    created = None
     for rank in range(COMM.size):
         if rank == COMM.rank:
-            made = Point(SPACE[name], d)
+            created = Point(SPACE[name], d)
         COMM.barrier()
-    return made
+    return created
 
 
 # ---- arguments -----------------------------------------------------------------------------------
@@ -173,26 +173,26 @@ def tangents(draw, n: np.ndarray, lengths=sizes):
 def arguments(draw, name: str, d: int, *, closed: bool = False):
     """Draw arguments of a law; ``closed``: with a closed gap."""
     n = draw(unit_vectors(d))
-    found = {"n": n, "gap": draw(signed), "u_n": draw(signed)}
+    drawn = {"n": n, "gap": draw(signed), "u_n": draw(signed)}
     if closed:
-        found["u_n"] = found["gap"] + draw(powers)
-        assume(found["u_n"] > found["gap"])
+        drawn["u_n"] = drawn["gap"] + draw(powers)
+        assume(drawn["u_n"] > drawn["gap"])
     for key in ("u_t", "moved", "old"):
-        found[key] = draw(tangents(n))
+        drawn[key] = draw(tangents(n))
     for key in SPACE[name].parameters():
         if key == "direction":
-            found[key] = draw(tangents(n, powers)) + draw(signed.filter(lambda x: abs(x) < 3)) * n
-            across = found[key] - (found[key] @ n) * n
-            assume(np.linalg.norm(across) > 0.1 * np.linalg.norm(found[key]))
+            drawn[key] = draw(tangents(n, powers)) + draw(signed.filter(lambda x: abs(x) < 3)) * n
+            across = drawn[key] - (drawn[key] @ n) * n
+            assume(np.linalg.norm(across) > 0.1 * np.linalg.norm(drawn[key]))
         elif key == "transverse_friction":
             continue
         else:
-            found[key] = draw(powers if key[:2] == "k_" or name.endswith("ellipse") else sizes)
+            drawn[key] = draw(powers if key[:2] == "k_" or name.endswith("ellipse") else sizes)
     if "transverse_friction" in SPACE[name].parameters():
-        found["friction"] = draw(powers)
+        drawn["friction"] = draw(powers)
         # Beyond this ratio the scaling itself loses the digits that are tested.
-        found["transverse_friction"] = found["friction"] * 10 ** draw(st.floats(-2, 2))
-    return found
+        drawn["transverse_friction"] = drawn["friction"] * 10 ** draw(st.floats(-2, 2))
+    return drawn
 
 
 # ---- references ----------------------------------------------------------------------------------
@@ -209,8 +209,8 @@ def loss(a: dict) -> float:
 
 def axes(a: dict) -> np.ndarray:
     """Return the tangents along the direction (by default x, else y) and across it, (2, 3)."""
-    given = a.get("direction", [1.0, 0, 0] if abs(a["n"][0]) < 0.9 else [0, 1.0, 0])
-    first = given - (given @ a["n"]) * a["n"]
+    direction = a.get("direction", [1.0, 0, 0] if abs(a["n"][0]) < 0.9 else [0, 1.0, 0])
+    first = direction - (direction @ a["n"]) * a["n"]
     first = first / np.linalg.norm(first)
     return np.array([first, np.cross(a["n"], first)])
 
@@ -406,8 +406,8 @@ def test_polygon_by_brute_force(sides, data):
         candidates = []
         for p, q in zip(ends, np.roll(ends, -1, axis=0), strict=True):
             length = (q - p) @ (q - p)
-            share = np.clip((start - p) @ (q - p) / length, 0, 1) if length > 0 else 0.0
-            candidates.append(p + share * (q - p))
+            fraction = np.clip((start - p) @ (q - p) / length, 0, 1) if length > 0 else 0.0
+            candidates.append(p + fraction * (q - p))
         expected = min(candidates, key=lambda c: np.linalg.norm(start - c))
     # The position along a side follows from τ*, with its rounding.
     assert np.abs(r["tau"] - expected).max() <= EXACT * size(a)

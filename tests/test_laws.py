@@ -117,7 +117,7 @@ class Scene:
             assert np.all(slips) if kind == "slip" else not np.any(slips)
 
 
-def central(scene: Scene, direction: np.ndarray, evaluate, h: float = 1e-5):
+def central_difference(scene: Scene, direction: np.ndarray, evaluate, h: float = 1e-5):
     """Return the central difference of ``evaluate()`` at u along a direction."""
     at = owned_values(scene.u).copy()
     ends = []
@@ -129,12 +129,12 @@ def central(scene: Scene, direction: np.ndarray, evaluate, h: float = 1e-5):
 
 
 def directions(scene: Scene) -> list[np.ndarray]:
-    found = []
+    vectors = []
     for seed in (11, 12):
         f = fem.Function(scene.space)
         f.interpolate(rough_field(scene.d, seed))
-        found.append(owned_values(f).copy())
-    return found
+        vectors.append(owned_values(f).copy())
+    return vectors
 
 
 @pytest.mark.each
@@ -173,14 +173,18 @@ def test_residual_and_tangent_are_derivatives(cell, degree, law):
         x, y = tangent.createVecs()
         for direction in directions(scene):
             if potential is not None:
-                difference = central(scene, direction, lambda: assemble_scalar(potential, COMM))
+                difference = central_difference(
+                    scene, direction, lambda: assemble_scalar(potential, COMM)
+                )
                 exact = COMM.allreduce(float(r @ direction))
                 # Relative to the sum of the magnitudes of all terms of the work.
                 size = COMM.allreduce(float(np.abs(r * direction).sum()))
                 assert abs(difference - exact) <= 1e-6 * size, state.name
             x.array[:] = direction
             tangent.mult(x, y)
-            difference = central(scene, direction, lambda: assemble_owned(residual, space))
+            difference = central_difference(
+                scene, direction, lambda: assemble_owned(residual, space)
+            )
             difference, exact = gather(COMM, difference), gather(COMM, y.array)
             # Where the tangent vanishes, the round-off of the residual divided by h remains.
             assert is_close(difference, exact, 1e-6, scale=max(np.abs(exact).max(), 1e-4)), (

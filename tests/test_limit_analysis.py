@@ -24,7 +24,7 @@ LEVER = (np.sqrt(2.0) + np.arcsinh(1.0)) / 6
 TURNED = 1 / 6
 
 
-def twisted(law, n=6, **options):
+def twisted_cube(law, n=6, **options):
     """Return an unconstrained cube pressed on the floor by 10, its contact and twisting load."""
     scene = block("hexahedron", n=n, up=-10.0)
     twist, x = fem.Constant(scene.mesh, 0.0), ufl.SpatialCoordinate(scene.mesh)
@@ -45,15 +45,15 @@ def test_limit_moment_of_a_twisted_cube():
 
     Tolerance 1e-2, of which half is due to the quadrature of r, which has a kink in the middle.
     """
-    problem, _, twist = twisted(fc.Tresca(MU, 10.0, k_n=1e5, k_t=1e5))
+    problem, _, twist = twisted_cube(fc.Tresca(MU, 10.0, k_n=1e5, k_t=1e5))
     most = MU * 10.0 * LEVER / TURNED
     twist.value = 0.98 * most
     assert overload(problem) is None
-    for share in (1.02, 3.0):
-        twist.value = share * most
-        found = overload(problem)
-        assert found.factor == pytest.approx(share, rel=1e-2)
-        assert "rotation about z" in found.describe()
+    for load_factor in (1.02, 3.0):
+        twist.value = load_factor * most
+        detected = overload(problem)
+        assert detected.factor == pytest.approx(load_factor, rel=1e-2)
+        assert "rotation about z" in detected.describe()
 
 
 @pytest.mark.each
@@ -65,7 +65,7 @@ def test_overload_is_reported_after_few_iterations(method):
     twisted cube, which is not uniform.
     """
     for law in (fc.Tresca(MU, 10.0, k_n=1e5, k_t=1e5), fc.Coulomb(MU, k_n=1e5, k_t=1e5)):
-        problem, contact, twist = twisted(law, n=3, method=method)
+        problem, contact, twist = twisted_cube(law, n=3, method=method)
         most = MU * 10.0 * LEVER / TURNED
         problem.solve()
         problem.commit()
@@ -102,16 +102,16 @@ def test_pressure_and_load_growing_together_is_no_overload(cell, method):
     problem.commit()
     scene.load(up=-10.0, side=0.9 * MU * 10.0)
     problem.solve()
-    found = contact.resultants()
-    assert found.force[0] == pytest.approx(-0.9 * MU * 10.0, rel=1e-6)
-    assert found.normal_force == pytest.approx(10.0, rel=1e-6)
+    computed = contact.resultants()
+    assert computed.force[0] == pytest.approx(-0.9 * MU * 10.0, rel=1e-6)
+    assert computed.normal_force == pytest.approx(10.0, rel=1e-6)
 
 
 @pytest.mark.each
 @pytest.mark.parametrize("method", [None, "lbfgs", "newton", "alternating", "continuation"])
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
-@pytest.mark.parametrize("by", ["top", "gap"])
-def test_tight_fit_is_no_overload(by, cell, method):
+@pytest.mark.parametrize("loading", ["top", "gap"])
+def test_tight_fit_is_no_overload(loading, cell, method):
     """A block clamped by prescribed displacements and pushed in one increment is no overload.
 
     Contact that is softened during the solution has less pressure and less friction than the
@@ -120,9 +120,11 @@ def test_tight_fit_is_no_overload(by, cell, method):
     """
     modulus, stiffness, depth = 1000.0, 1e5, 1e-3
     scene = block(cell, E=modulus, nu=0.0, n=4)
-    pressed = scene.dirichlet_bc(TOP, scene.mesh.geometry.dim - 1, -depth if by == "top" else 0.0)
+    pressed = scene.dirichlet_bc(
+        TOP, scene.mesh.geometry.dim - 1, -depth if loading == "top" else 0.0
+    )
     law, contact = fc.Coulomb(MU, k_n=stiffness, k_t=stiffness), {}
-    if by == "gap":
+    if loading == "gap":
         contact["gap"] = -depth
     problem, contact = scene.problem(
         law, [pressed], contact=contact, small_displacement_tolerance=np.inf, method=method
@@ -130,17 +132,19 @@ def test_tight_fit_is_no_overload(by, cell, method):
     force = depth / (1 / modulus + 1 / stiffness)
     scene.load(side=0.8 * MU * force)
     problem.solve()
-    found = contact.resultants()
-    assert found.force[0] == pytest.approx(-0.8 * MU * force, rel=1e-6)
-    assert found.normal_force == pytest.approx(force, rel=1e-6)
+    computed = contact.resultants()
+    assert computed.force[0] == pytest.approx(-0.8 * MU * force, rel=1e-6)
+    assert computed.normal_force == pytest.approx(force, rel=1e-6)
 
 
 @pytest.mark.each
 @pytest.mark.parametrize("method", [None, "lbfgs", "newton", "alternating", "continuation"])
 @pytest.mark.parametrize("stiffness", [1e1, 1e3])
-@pytest.mark.parametrize("share", [0.7, 0.8, 0.97])
-@pytest.mark.parametrize("by", ["top", "gap"])
-def test_tight_fit_with_multipliers_and_soft_springs_is_no_overload(by, share, stiffness, method):
+@pytest.mark.parametrize("load_factor", [0.7, 0.8, 0.97])
+@pytest.mark.parametrize("loading", ["top", "gap"])
+def test_tight_fit_with_multipliers_and_soft_springs_is_no_overload(
+    loading, load_factor, stiffness, method
+):
     """The load exceeds the limit of the springs before augmentation, but not that of multipliers.
 
     Reference: only the column deforms, N = δ E / h. The penalty part may be as large as the
@@ -148,9 +152,9 @@ def test_tight_fit_with_multipliers_and_soft_springs_is_no_overload(by, share, s
     """
     modulus, depth, tolerance = 1000.0, 1e-3, 1e-6
     scene = block("quadrilateral", E=modulus, nu=0.0, n=4)
-    pressed = scene.dirichlet_bc(TOP, 1, -depth if by == "top" else 0.0)
+    pressed = scene.dirichlet_bc(TOP, 1, -depth if loading == "top" else 0.0)
     contact = {"enforcement": "augmented", "tolerance": tolerance}
-    if by == "gap":
+    if loading == "gap":
         contact["gap"] = -depth
     problem, contact = scene.problem(
         fc.Coulomb(MU, k_n=stiffness, k_t=stiffness),
@@ -160,23 +164,23 @@ def test_tight_fit_with_multipliers_and_soft_springs_is_no_overload(by, share, s
         method=method,
     )
     force = depth * modulus
-    scene.load(side=share * MU * force)
+    scene.load(side=load_factor * MU * force)
     problem.solve()
-    found = contact.resultants()
-    assert found.force[0] == pytest.approx(-share * MU * force, rel=10 * tolerance)
-    assert found.normal_force == pytest.approx(force, rel=(1 + modulus / stiffness) * tolerance)
+    computed = contact.resultants()
+    assert computed.force[0] == pytest.approx(-load_factor * MU * force, rel=10 * tolerance)
+    assert computed.normal_force == pytest.approx(force, rel=(1 + modulus / stiffness) * tolerance)
 
 
 # Body forces on an area of 2, and the error text about their resultant and the contact force.
-NOT_HELD = {
+UNCONSTRAINED = {
     "falls": ((0.0, -1.0), "translation along y) is -2, of which contact can balance at most 0 "),
     "pushed": ((2.0, 5.0), "translation along x) is 4, of which contact can balance at most 3 "),
 }
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-@pytest.mark.parametrize("what", NOT_HELD)
-def test_unconstrained_rubber_is_refused_with_limit_load(what, kinematics):
+@pytest.mark.parametrize("case", UNCONSTRAINED)
+def test_unconstrained_rubber_is_refused_with_limit_load(case, kinematics):
     """Rubber pressed against a ceiling by a body force of 5 then falls, or is pushed by too much.
 
     The error states the rigid-body mode, the load along it, and the largest contact force along it,
@@ -195,12 +199,12 @@ def test_unconstrained_rubber_is_refused_with_limit_load(what, kinematics):
     )
     problem.solve()
     problem.commit()
-    made: list[int] = []
-    problem.snes.setMonitor(lambda snes, iteration, norm: made.append(iteration))
-    force.value[:], text = NOT_HELD[what]
+    iterations: list[int] = []
+    problem.snes.setMonitor(lambda snes, iteration, norm: iterations.append(iteration))
+    force.value[:], text = UNCONSTRAINED[case]
     assert_raised_on_all_ranks(problem.solve, ValueError, text)
     # Measured: 18 residuals in all cases; a second attempt would have at least 14 more.
-    assert len(made) <= 30
+    assert len(iterations) <= 30
 
 
 @pytest.mark.whole
@@ -222,13 +226,13 @@ def test_slow_augmentations_are_continued_to_equilibrium(method):
         small_displacement_tolerance=np.inf,
         method=method,
     )
-    for force, share in ((1000.0, 0.5), (100.0, -0.25), (100.0, 0.625)):
+    for force, load_factor in ((1000.0, 0.5), (100.0, -0.25), (100.0, 0.625)):
         depth.value = -force / modulus
-        scene.load(side=share * MU * force)
+        scene.load(side=load_factor * MU * force)
         problem.solve()
         problem.commit()
-        found = contact.resultants().force[0]
-        assert found == pytest.approx(-share * MU * force, rel=1e-6)
+        computed = contact.resultants().force[0]
+        assert computed == pytest.approx(-load_factor * MU * force, rel=1e-6)
 
 
 def test_overload_of_a_clamped_block_is_reported():
@@ -240,13 +244,15 @@ def test_overload_of_a_clamped_block_is_reported():
     """
     modulus, height = 1000.0, 0.5
 
-    def made(low, n):
+    def make_block(low, n):
         corners = [(0.0, low), (1.0, low + height)]
         mesh = dolfinx.mesh.create_rectangle(MPI.COMM_WORLD, corners, (n, n))
         ends = {1: lambda x: np.isclose(x[1], low), 2: lambda x: np.isclose(x[1], low + height)}
         return mesh, None, tag_by_nodes(mesh, ends)
 
-    joined = fc.join_meshes({"a": made(0.0, 2), "b": made(height, 1), "c": made(2 * height, 3)})
+    joined = fc.join_meshes(
+        {"a": make_block(0.0, 2), "b": make_block(height, 1), "c": make_block(2 * height, 3)}
+    )
     space = fem.functionspace(joined.mesh, ("Lagrange", 1, (2,)))
     u, v = fem.Function(space), ufl.TestFunction(space)
     depth, push = fem.Constant(joined.mesh, 0.0), fem.Constant(joined.mesh, 0.0)
@@ -267,9 +273,9 @@ def test_overload_of_a_clamped_block_is_reported():
     problem = fc.ContactProblem(
         F, u, bcs=bcs, contacts=contacts, small_displacement_tolerance=np.inf, method="newton"
     )
-    for force, share in ((10.0, 0.13), (1.0, 1.02)):
-        depth.value, push.value = -force * 3 * height / modulus, 2 * share * MU * force
-        if share < 1.0:
+    for force, load_factor in ((10.0, 0.13), (1.0, 1.02)):
+        depth.value, push.value = -force * 3 * height / modulus, 2 * load_factor * MU * force
+        if load_factor < 1.0:
             problem.solve()
             problem.commit()
             continue
@@ -309,8 +315,10 @@ def groove(angle, n):
     return problem, contacts, load, volume
 
 
-@pytest.mark.parametrize(("n", "share", "before"), [((1, 2, 1), 0.9, 0.0), ((2, 2, 2), 0.8, 100.0)])
-def test_wedge_in_a_groove_below_its_limit_is_no_overload(n, share, before):
+@pytest.mark.parametrize(
+    ("n", "load_factor", "before"), [((1, 2, 1), 0.9, 0.0), ((2, 2, 2), 0.8, 100.0)]
+)
+def test_wedge_in_a_groove_below_its_limit_is_no_overload(n, load_factor, before):
     """A wedge pushed along its groove by less than 2 μ N, N = P/(2 sin α), is no overload.
 
     At a larger friction coefficient friction also balances a part of P, and N decreases: with those
@@ -323,7 +331,7 @@ def test_wedge_in_a_groove_below_its_limit_is_no_overload(n, share, before):
         load.value[2] = -before * down / volume
         problem.solve()
         problem.commit()
-    along = share * 0.5 * down / np.sin(angle)
+    along = load_factor * 0.5 * down / np.sin(angle)
     load.value[:] = 0.0, along / volume, -down / volume
     problem.solve()
     force = sum(contact.resultants().force for contact in contacts)
@@ -352,19 +360,19 @@ def test_limit_analysis_of_polygons_and_unsupported_cases():
         scene = block("hexahedron", n=2, size=(1.0, 1.0, 0.25), up=-10.0)
         law = fc.Tresca(MU, 10.0, 1e5, 1e5, modes=modes, direction=modes and (1.0, 0.0, 0.0))
         problem, _ = scene.problem(law, [])
-        for share, is_found in ((0.99 * most, False), (1.01 * most, True)):
-            scene.load(up=-10.0, side=share * MU * 10.0)
+        for load_factor, is_found in ((0.99 * most, False), (1.01 * most, True)):
+            scene.load(up=-10.0, side=load_factor * MU * 10.0)
             assert (overload(problem) is not None) == is_found
     tresca = fc.Tresca(MU, 10.0, 1e5, 1e5)
     turned = fc.Rotation(None, (0.5, 0.5, 0.0), axis=(0.0, 0.0, 1.0), moment=1.0)
     turns = fc.HalfSpace((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), rotation=turned)
-    for law, held, contact in (
+    for law, constrained, contact in (
         (fc.Foundation(1e5, 1e5), False, {}),
         (fc.Foundation(1e5, 1e5, tension=True), False, {}),
         (tresca, False, {"kinematics": "finite"}),
         (tresca, True, {"obstacle": turns, "kinematics": "finite"}),
     ):
         scene = block("hexahedron", n=2, size=(1.0, 1.0, 0.25), up=-10.0, side=4.0)
-        bcs = [scene.dirichlet_bc(TOP, i) for i in range(3)] if held else []
+        bcs = [scene.dirichlet_bc(TOP, i) for i in range(3)] if constrained else []
         problem, _ = scene.problem(law, bcs, contact=contact)
         assert overload(problem) is None

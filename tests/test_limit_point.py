@@ -46,23 +46,23 @@ class Separation(Law):
         return -np.e * parameters["strength"] * (kinematics.gap + d) * ufl.exp(-kinematics.gap / d)
 
 
-def pulled(by):
+def glued_block(loading):
     """Return a block of size 1 glued to a floor, pulled by "force" or else by displacement."""
     scene = block("quadrilateral", n=2, E=1e3, nu=0.0, up=0.0)
-    led = fem.Constant(scene.mesh, 0.0)
-    bcs = [] if by == "force" else [scene.dirichlet_bc(TOP, 1, led)]
+    displacement = fem.Constant(scene.mesh, 0.0)
+    bcs = [] if loading == "force" else [scene.dirichlet_bc(TOP, 1, displacement)]
     options = {"small_displacement_tolerance": np.inf}
     problem, _ = scene.problem(Separation(PEAK, REACH), [*scene.rollers(), *bcs], **options)
 
     def load(value):
-        scene.load(up=value) if by == "force" else setattr(led, "value", value)
+        scene.load(up=value) if loading == "force" else setattr(displacement, "value", value)
 
     return problem, load
 
 
 def test_force_control_stops_at_the_maximum_load():
     """The last load is area times strength, to twice the smallest increment, 0.25/64."""
-    problem, load = pulled("force")
+    problem, load = glued_block("force")
     reached = []
 
     def history():
@@ -75,7 +75,7 @@ def test_force_control_stops_at_the_maximum_load():
 
 def test_displacement_control_passes_the_maximum_load():
     """Column and glue in series have p = r_n(u - p/E), to 1e-6, before and after the peak."""
-    problem, load = pulled("displacement")
+    problem, load = glued_block("displacement")
     forces = []
     for step in fc.increments(problem, load, 0.0, 5 * REACH, steps=25):
         force = step.contacts["contact"].force[1]
@@ -87,7 +87,7 @@ def test_displacement_control_passes_the_maximum_load():
 
 def test_other_failures_are_not_reported_as_limit_point():
     """A failure below the maximum, here without iterations, is not reported as a limit point."""
-    problem, load = pulled("force")
+    problem, load = glued_block("force")
     history = fc.increments(problem, load, 0.0, 1.0, steps=4)
     next(history)
     problem.solver.main.max_it = 0

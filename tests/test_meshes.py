@@ -146,12 +146,13 @@ SQUARES = {
 
 def from_arrays(rank: int = 0, **changes: Any) -> tuple[Any, Any, Any]:
     """Return the mesh of the squares, with these changes; the arrays are on one rank alone."""
-    given = SQUARES | changes
-    mine = COMM.rank == rank
+    options = SQUARES | changes
+    on_rank = COMM.rank == rank
     arrays = {
-        name: given[name] if mine else None for name in ("points", "cells", "facets", "cell_tags")
+        name: options[name] if on_rank else None
+        for name in ("points", "cells", "facets", "cell_tags")
     }
-    others = {name: value for name, value in given.items() if name not in arrays}
+    others = {name: value for name, value in options.items() if name not in arrays}
     points, cells = arrays.pop("points"), arrays.pop("cells")
     return fc.mesh_from_arrays(COMM, points, cells, **arrays, **others, rank=rank)
 
@@ -213,9 +214,9 @@ def gmsh_grid(kind: str, order: int) -> tuple[Any, Any, Any]:
 
     box = (-0.1, -0.1, -0.1, 0.1, 1.1, 1.1, dim - 1)
     ((_, side),) = gmsh.model.getEntitiesInBoundingBox(*box)
-    found = points[:, :dim], elements(dim), elements(dim - 1, side)
+    arrays = points[:, :dim], elements(dim), elements(dim - 1, side)
     gmsh.finalize()
-    return found
+    return arrays
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -299,8 +300,8 @@ def test_arrays_by_meshio(tmp_path: Any) -> None:
     if COMM.rank == 0:
         blocks = [("quad", SQUARES["cells"]), ("line", SQUARES["facets"][BOTTOM])]
         data = {"tags": [[LEFT, RIGHT], [BOTTOM, BOTTOM]]}
-        made = meshio.Mesh(np.array(SQUARES["points"], dtype=float), blocks, cell_data=data)
-        meshio.write(file, made)
+        meshio_mesh = meshio.Mesh(np.array(SQUARES["points"], dtype=float), blocks, cell_data=data)
+        meshio.write(file, meshio_mesh)
         read = meshio.read(file)
         arrays = read.points[:, :2], read.cells_dict["quad"], {BOTTOM: read.cells_dict["line"]}
     points, cells, facets = arrays

@@ -62,25 +62,27 @@ def test_history_is_verified_and_balances(variant):
     The reactions of the bottom, assembled here, balance the contact force to 1e-10.
     """
     solver = {"cross_check": True} | VARIANTS[variant].get("solver", {})
-    made = DiscOnRubber(
+    setup = DiscOnRubber(
         "triangle",
         n=(8, 4),
         **{**VARIANTS[variant], "solver": {"petsc_options": TIGHT_TOLERANCE, **solver}},
     )
-    scene, problem = made.scene, made.problem
+    scene, problem = setup.scene, setup.problem
     form, part = compile_with_maps(scene.F), problem.displacement
-    held = fem.Function(part.u.function_space)
-    for step in made.increments():
+    bottom_value = fem.Function(part.u.function_space)
+    for step in setup.increments():
         assert not step.verdict.failures and step.verdict.cross_check
         forces = assemble_owned(form, scene.u.function_space)
         forces[~problem.full.constrained[: forces.size]] = 0.0
         reaction = np.zeros(scene.dim)
         for i in range(scene.dim):
-            held.x.array[:] = 0.0
-            held.x.array[i :: scene.dim] = 1.0
-            reaction[i] = scene.mesh.comm.allreduce(part.within(owned_values(held)) @ forces)
-        assert is_close(-reaction, made.resultant(), 1e-10)
-    assert np.abs(made.resultant()).min() > 0.1
+            bottom_value.x.array[:] = 0.0
+            bottom_value.x.array[i :: scene.dim] = 1.0
+            reaction[i] = scene.mesh.comm.allreduce(
+                part.within(owned_values(bottom_value)) @ forces
+            )
+        assert is_close(-reaction, setup.resultant(), 1e-10)
+    assert np.abs(setup.resultant()).min() > 0.1
 
 
 @pytest.mark.each
@@ -93,24 +95,24 @@ def test_restart_from_a_checkpoint(variant, tmp_path):
 @pytest.mark.parametrize("variant", ["Taylor-Hood", "linear"])
 def test_lbfgs_agrees_with_newton(variant):
     """L-BFGS with the factored saddle point as H₀ needs no minimum: tractions of Newton, 1e-7."""
-    found = []
+    computed = []
     for method in ("newton", "lbfgs"):
         solver = VARIANTS[variant].get("solver", {}) | {"method": method, "fallback": False}
-        made = DiscOnRubber("triangle", n=(8, 4), **{**VARIANTS[variant], "solver": solver})
-        for step in made.increments(2.0, steps=8, max_cuts=0):
+        setup = DiscOnRubber("triangle", n=(8, 4), **{**VARIANTS[variant], "solver": solver})
+        for step in setup.increments(2.0, steps=8, max_cuts=0):
             assert step.method == method
-        found.append(made.tractions())
-    assert np.abs(found[0]).max() > 10.0
-    assert is_close(found[1], found[0], 1e-7)
+        computed.append(setup.tractions())
+    assert np.abs(computed[0]).max() > 10.0
+    assert is_close(computed[1], computed[0], 1e-7)
 
 
 def test_tetrahedra_are_verified():
     """Verdicts pass for incompressible tetrahedra pressed and dragged with friction."""
     for variant in ("Taylor-Hood", "MINI"):
-        made = tool(variant, "tetrahedron")
-        for step in made.increments(1.5):
+        setup = tool(variant, "tetrahedron")
+        for step in setup.increments(1.5):
             assert not step.verdict.failures
-        assert made.resultant()[-1] < -1.0
+        assert setup.resultant()[-1] < -1.0
 
 
 def test_first_touch_with_cut_increments():
@@ -120,14 +122,14 @@ def test_first_touch_with_cut_increments():
     """
     ends = []
     for steps in (1, 10):
-        made = DiscOnRubber("triangle", n=(8, 4), law=fc.Frictionless(1e4), **VARIANTS["MINI"])
+        setup = DiscOnRubber("triangle", n=(8, 4), law=fc.Frictionless(1e4), **VARIANTS["MINI"])
 
-        def load(t, made=made):
-            made.shift.value[:] = made.vector(0.1, 0.5 - 0.8 * t)
+        def load(t, setup=setup):
+            setup.shift.value[:] = setup.vector(0.1, 0.5 - 0.8 * t)
 
-        *_, last = fc.increments(made.problem, load, 0.0, 1.0, steps=steps)
+        *_, last = fc.increments(setup.problem, load, 0.0, 1.0, steps=steps)
         assert last.increment >= steps
-        ends.append(made.tractions())
+        ends.append(setup.tractions())
     assert np.abs(ends[1]).max() > 100.0
     assert is_close(ends[0], ends[1], 1e-7)
 
@@ -159,8 +161,8 @@ def test_contact_form_in_a_user_written_block_newton_method():
     forms = [compile_with_maps(part, contact) for part in ufl.extract_blocks(residual)]
     blocks = [[compile_with_maps(b, contact) for b in row] for row in ufl.extract_blocks(tangent)]
     dofs = fem.locate_dofs_topological(V, tags.dim, tags.find(BOTTOM))
-    held, n_held = fem.dirichletbc(np.zeros(d), dofs, V).dof_indices()
-    held = held[:n_held]
+    constrained, n_held = fem.dirichletbc(np.zeros(d), dofs, V).dof_indices()
+    constrained = constrained[:n_held]
     solver = PETSc.KSP().create(mesh.comm)
     solver.setType("preonly")
     solver.getPC().setType("lu")
@@ -171,10 +173,10 @@ def test_contact_form_in_a_user_written_block_newton_method():
         for _ in range(30):
             A = PETSc.Mat().createNest([[assemble_matrix(b) for b in row] for row in blocks])
             A.convert("aij")
-            A.zeroRows((A.getOwnershipRange()[0] + held).astype(PETSc.IntType), 1.0)
+            A.zeroRows((A.getOwnershipRange()[0] + constrained).astype(PETSc.IntType), 1.0)
             b, step = A.createVecLeft(), A.createVecRight()
             forces, excess = assemble_owned(forms[0], V), assemble_owned(forms[1], Q)
-            forces[held] = 0.0
+            forces[constrained] = 0.0
             b.array[:] = np.concatenate([forces, excess])
             solver.setOperators(A)
             solver.solve(b, step)
@@ -227,9 +229,9 @@ def test_tangent_and_boundary_form_of_mixed_functions(name, kinematics):
     v, dw = split(ufl.TestFunctions(W))[0], ufl.TrialFunction(W)
     assembled = assemble_owned(compile_with_maps(contact.form(v), contact), W)
     assert global_max(comm, np.abs(assembled - forces)) < 1e-11 * global_max(comm, np.abs(forces))
-    theirs = assemble_matrix(compile_with_maps(contact.tangent(v, dw), contact))
-    other = theirs.createVecLeft()
-    theirs.mult(direction.x.petsc_vec, other)
+    from_form = assemble_matrix(compile_with_maps(contact.tangent(v, dw), contact))
+    other = from_form.createVecLeft()
+    from_form.mult(direction.x.petsc_vec, other)
     assert global_max(comm, np.abs(other.array_r - product.array_r)) < 1e-11 * size
     contact.evaluate()
     r = contact.resultants()
@@ -239,7 +241,7 @@ def test_tangent_and_boundary_form_of_mixed_functions(name, kinematics):
 @pytest.mark.parametrize("variant", ["Taylor-Hood", "linear"])
 def test_units_do_not_matter(variant):
     """A block in mm and MPa, and in m and GPa, has the same iterations, and tractions to 1e-9."""
-    found = []
+    computed = []
     for length, stress in ((1.0, 1.0), (1e-3, 1e-3)):
         scene = rubber(
             "triangle",
@@ -258,10 +260,10 @@ def test_units_do_not_matter(variant):
             shift.value[:] = np.array(displacement) * length
             iterations.append(problem.solve().iterations)
             problem.commit()
-        found.append((iterations, point_values(contact, contact.traction) / stress))
-    assert found[0][0] == found[1][0]
-    assert np.abs(found[0][1]).max() > 10.0
-    assert is_close(found[1][1], found[0][1], 1e-9)
+        computed.append((iterations, point_values(contact, contact.traction) / stress))
+    assert computed[0][0] == computed[1][0]
+    assert np.abs(computed[0][1]).max() > 10.0
+    assert is_close(computed[1][1], computed[0][1], 1e-9)
 
 
 def test_cells_inverted_by_bubbles_are_detected():
@@ -327,7 +329,7 @@ def test_problem_without_contacts_finds_its_displacement_field():
     problem = fc.ContactProblem(scene.F, scene.u, bcs=bcs)
     problem.solve()
     volume = compile_form(scene.body.J * ufl.dx(scene.mesh))
-    found = scene.mesh.comm.allreduce(fem.assemble_scalar(volume))
-    assert found == pytest.approx(2.0, rel=1e-6)
+    computed = scene.mesh.comm.allreduce(fem.assemble_scalar(volume))
+    assert computed == pytest.approx(2.0, rel=1e-6)
     assert problem.displacement.u.x.array.size == top.x.array.size
     assert global_max(scene.mesh.comm, np.abs(problem.displacement.u.x.array)) > 0.1

@@ -76,13 +76,13 @@ class Blocks:
         self.along, self.down = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
         nothing = fem.Constant(mesh, 0.0)
         left = tag_by_nodes(mesh, {9: plane(0, 0.0)})
-        held = [(tags, BOTTOM, 1, nothing), (tags, TOP, 1, self.down)]
+        conditions = [(tags, BOTTOM, 1, nothing), (tags, TOP, 1, self.down)]
         if smooth:
-            held += [(left, 9, 0, nothing)]
+            conditions += [(left, 9, 0, nothing)]
         else:
-            held += [(tags, BOTTOM, 0, nothing), (tags, TOP, 0, self.along)]
+            conditions += [(tags, BOTTOM, 0, nothing), (tags, TOP, 0, self.along)]
         bcs = []
-        for where, tag, i, value in held:
+        for where, tag, i, value in conditions:
             part = W.sub(0).sub(i)
             dofs = fem.locate_dofs_topological(part, 1, where.find(tag))
             bcs.append(fem.dirichletbc(value, dofs, part))
@@ -110,13 +110,13 @@ class Blocks:
         """Assemble the reaction of the nodes at a height, (2,). Collective."""
         forces = assemble_owned(self.form, self.w.function_space)
         part = self.problem.displacement
-        found = np.zeros(2)
+        computed = np.zeros(2)
         for i in range(2):
             chosen = fem.Function(part.u.function_space)
-            there = np.isclose(part.u.function_space.tabulate_dof_coordinates()[:, 1], height)
-            chosen.x.array[i::2] = there
-            found[i] = self.mesh.comm.allreduce(part.within(owned_values(chosen)) @ forces)
-        return found
+            at_height = np.isclose(part.u.function_space.tabulate_dof_coordinates()[:, 1], height)
+            chosen.x.array[i::2] = at_height
+            computed[i] = self.mesh.comm.allreduce(part.within(owned_values(chosen)) @ forces)
+        return computed
 
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
@@ -136,21 +136,21 @@ def test_uniform_compression(kinematics, mixed, enforcement):
     options = {"enforcement": enforcement}
     if enforcement == "augmented":
         options["tolerance"] = 1e-9
-    made = Blocks(
+    setup = Blocks(
         kinematics,
         fc.Coulomb(0.3, k_n, k_n),
         mixed=mixed,
         smooth=True,
         contact=options,
     )
-    for share in (0.5, 1.0):
-        made.down.value = -share * down
-        step = made.problem.solve()
-        made.problem.commit()
+    for factor in (0.5, 1.0):
+        setup.down.value = -factor * down
+        step = setup.problem.solve()
+        setup.problem.commit()
     force = step.contacts["contact"]
     assert force.normal_force == pytest.approx(-nominal, rel=1e-6)
     assert force.slip == 0 and force.tangential_force < 1e-6 * force.normal_force
-    assert is_close(made.contact.pressure, np.full_like(made.contact.pressure, -nominal), 1e-6)
+    assert is_close(setup.contact.pressure, np.full_like(setup.contact.pressure, -nominal), 1e-6)
 
 
 @pytest.mark.parametrize("enforcement", ["penalty", "augmented"])
@@ -161,7 +161,7 @@ def test_dragged_block_slips_at_the_friction_bound(kinematics, enforcement):
     That, and the balance of the contact force and the assembled reactions of bottom and top, holds
     to 1e-9.
     """
-    made = Blocks(
+    setup = Blocks(
         kinematics,
         fc.Coulomb(0.3),
         n=(8, 4),
@@ -169,11 +169,11 @@ def test_dragged_block_slips_at_the_friction_bound(kinematics, enforcement):
         shift=0.25,
         contact={"enforcement": enforcement},
     )
-    for step in fc.increments(made.problem, made.load, 0, 1, steps=8):
+    for step in fc.increments(setup.problem, setup.load, 0, 1, steps=8):
         assert not step.verdict.failures
         force = step.contacts["contact"].force
-        assert is_close(made.reaction(1.0), -force, 1e-9)
-        assert is_close(made.reaction(0.0), force, 1e-9)
+        assert is_close(setup.reaction(1.0), -force, 1e-9)
+        assert is_close(setup.reaction(0.0), force, 1e-9)
     last = step.contacts["contact"]
     assert last.slip > 0 and last.stick == 0
     assert force[0] < 0 < force[1]
@@ -189,8 +189,8 @@ def test_restarted_history_gives_the_same_solution(kinematics, tmp_path):
         return Blocks(kinematics, fc.Coulomb(0.3), **wide)
 
     folder = shared_folder(tmp_path)
-    whole, first, second = make(), make(), make()
-    for _ in fc.increments(whole.problem, whole.load, 0, 1, steps=8):
+    uninterrupted, first, second = make(), make(), make()
+    for _ in fc.increments(uninterrupted.problem, uninterrupted.load, 0, 1, steps=8):
         pass
     file = folder / "state.npz"
     for step in fc.increments(first.problem, first.load, 0, 1, steps=8, checkpoint=file):
@@ -198,6 +198,6 @@ def test_restarted_history_gives_the_same_solution(kinematics, tmp_path):
             break
     for _ in fc.increments(second.problem, second.load, 0, 1, steps=8, checkpoint=file):
         pass
-    forces = [each.contact.resultants().force for each in (whole, second)]
+    forces = [each.contact.resultants().force for each in (uninterrupted, second)]
     assert is_close(forces[1], forces[0], 1e-9)
-    assert is_close(owned_values(second.w), owned_values(whole.w), 1e-9)
+    assert is_close(owned_values(second.w), owned_values(uninterrupted.w), 1e-9)

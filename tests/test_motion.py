@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.three_ranks, pytest.mark.newest]
 COMM = MPI.COMM_WORLD
 
 
-def pressed(cell, law, motion, method="lbfgs"):
+def pressed_block(cell, law, motion, method="lbfgs"):
     scene = block(cell, 1, n=4)
     d = scene.dim
     bcs = [scene.dirichlet_bc(TOP, i) for i in range(d)]
@@ -36,10 +36,10 @@ def test_given_force_and_given_displacement_have_the_same_state(cell, method):
     """
     d = 2 if cell == "triangle" else 3
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
-    force, drag = 5.0, 0.01
+    force, slide = 5.0, 0.01
     across = [None] * (d - 1) + [force]
-    motion = fc.Motion(force=across, displacement=[drag] + [0.0] * (d - 2) + [None])
-    scene, problem, contact = pressed(cell, law, motion, method)
+    motion = fc.Motion(force=across, displacement=[slide] + [0.0] * (d - 2) + [None])
+    scene, problem, contact = pressed_block(cell, law, motion, method)
     problem.solve()
     problem.commit()
     assert is_close(contact.resultants().force[-1], force, 1e-8)
@@ -47,18 +47,18 @@ def test_given_force_and_given_displacement_have_the_same_state(cell, method):
     up = float(contact.free_motion[d - 1].value)
     assert up > 0
 
-    given = np.zeros(d)
-    given[0], given[-1] = drag, up
-    other, problem, again = pressed(cell, law, given, method)
+    prescribed_displacement = np.zeros(d)
+    prescribed_displacement[0], prescribed_displacement[-1] = slide, up
+    other, problem, same_contact = pressed_block(cell, law, prescribed_displacement, method)
     problem.solve()
-    assert is_close(again.resultants().force, contact.resultants().force, 1e-7)
+    assert is_close(same_contact.resultants().force, contact.resultants().force, 1e-7)
     assert is_close(nodal_values(other.u), nodal_values(scene.u), 1e-7)
 
 
 def test_newton_converges_quadratically_with_a_rotating_normal():
     """The tangent includes the derivative of a ball's normal with respect to its motion."""
     motion = fc.Motion(force=(0.5, 5.0))
-    _, problem, contact = pressed(
+    _, problem, contact = pressed_block(
         "quadrilateral", fc.Coulomb(1.0, k_n=2e4, k_t=1e4), motion, "newton"
     )
     problem.solve()

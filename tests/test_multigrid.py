@@ -32,7 +32,7 @@ TIGHT = {"snes_rtol": 1e-12}
 SAME = 1e-8
 
 
-def both(make):
+def results_of_both_solvers(make):
     """Return the results of ``make(**options)`` by factorisation and by multigrid, for all dofs."""
     return [
         make(linear_solver=kind, condensation=False, petsc_options=TIGHT) for kind in linear.KINDS
@@ -46,16 +46,16 @@ def assert_same_path(cell, degree, method, n, path):
     """
 
     def make(**options):
-        made = BlockOnBall(cell=cell, degree=degree, mesh={"n": n}, method=method, **options)
-        steps = solve_path(made, path=path)
+        setup = BlockOnBall(cell=cell, degree=degree, mesh={"n": n}, method=method, **options)
+        steps = solve_path(setup, path=path)
         if options["linear_solver"] == "multigrid":
             assert [s.factorisations for s in steps] == [0] * len(path)
-        assert made.contact.resultants().slip > 0
+        assert setup.contact.resultants().slip > 0
         if options["linear_solver"] == "multigrid" and method != "alternating":
-            assert made.problem.snes.getKSP().getPC().getMGLevels() > 1
-        return nodal_values(made.scene.u), point_values(made.contact, made.contact.traction)
+            assert setup.problem.snes.getKSP().getPC().getMGLevels() > 1
+        return nodal_values(setup.scene.u), point_values(setup.contact, setup.contact.traction)
 
-    direct, multigrid = both(make)
+    direct, multigrid = results_of_both_solvers(make)
     for by_factors, by_cycles in zip(direct, multigrid, strict=True):
         assert is_close(by_cycles, by_factors, SAME)
 
@@ -87,7 +87,7 @@ def test_body_constrained_by_contact_alone(cell, method):
         assert is_close(contact.resultants().force, -scene.vector(side=0.2, up=-1.0), 1e-9)
         return nodal_values(scene.u)
 
-    direct, multigrid = both(make)
+    direct, multigrid = results_of_both_solvers(make)
     assert is_close(multigrid, direct, SAME)
 
 
@@ -101,7 +101,7 @@ def test_problem_without_contact(method):
         fc.ContactProblem(scene.F, scene.u, bcs=bcs, method=method, **options).solve()
         return nodal_values(scene.u)
 
-    direct, multigrid = both(make)
+    direct, multigrid = results_of_both_solvers(make)
     assert is_close(multigrid, direct, SAME)
 
 
@@ -128,7 +128,7 @@ def test_two_bodies(cell, method):
         problem.solve()
         return nodal_values(u)
 
-    direct, multigrid = both(make)
+    direct, multigrid = results_of_both_solvers(make)
     assert is_close(multigrid, direct, SAME)
 
 
@@ -140,9 +140,9 @@ def test_units(method):
     partitioner may distribute equal meshes differently, and the smoother depends on the cells of
     each rank.
     """
-    found = []
+    computed = []
     for length, pressure in [(1.0, 1.0), (1e-3, 1e6), (1e-9, 1e9)]:
-        made = BlockOnBall(
+        setup = BlockOnBall(
             cell="hexahedron",
             mesh={
                 "n": 6,
@@ -155,11 +155,11 @@ def test_units(method):
             linear_solver="multigrid",
             petsc_options=TIGHT,
         )
-        steps = solve_path(made, length, PATH[:2])
-        found.append(([s.iterations for s in steps], nodal_values(made.scene.u) / length))
-    for iterations, u in found[1:]:
-        assert iterations == pytest.approx(found[0][0], rel=0.1 if COMM.size > 1 else 0.0)
-        assert is_close(u, found[0][1], 1e-9)
+        steps = solve_path(setup, length, PATH[:2])
+        computed.append(([s.iterations for s in steps], nodal_values(setup.scene.u) / length))
+    for iterations, u in computed[1:]:
+        assert iterations == pytest.approx(computed[0][0], rel=0.1 if COMM.size > 1 else 0.0)
+        assert is_close(u, computed[0][1], 1e-9)
 
 
 def krylov_iterations(n: int, *, rotations: bool) -> int:
@@ -171,10 +171,10 @@ def krylov_iterations(n: int, *, rotations: bool) -> int:
     problem.solver.system.fill(matrix, [])
     if not rotations:
         matrix.setNearNullSpace(PETSc.NullSpace())
-    force, found = matrix.createVecs()
+    force, solution = matrix.createVecs()
     force.array[:] = np.where(problem.full.constrained, 0.0, 1.0)
     with problem.solver.options.present():
-        solver.solve(force, found)
+        solver.solve(force, solution)
     assert solver.getConvergedReason() > 0
     return solver.getIterationNumber()
 
@@ -229,8 +229,8 @@ def test_multigrid_is_selected_if_memory_is_short(caplog, monkeypatch):
     assert problem.full.linear_kind == "multigrid"
     assert "GiB of memory" in log_messages(caplog) and "multigrid" in log_messages(caplog)
     assert problem.solve().factorisations == 0
-    wanted, _ = scene.problem(fc.Frictionless(), scene.rollers(), linear_solver="direct")
-    assert wanted.full.linear_kind == "direct"
+    requested, _ = scene.problem(fc.Frictionless(), scene.rollers(), linear_solver="direct")
+    assert requested.full.linear_kind == "direct"
 
 
 def test_multigrid_is_selected_if_it_is_faster():
@@ -266,9 +266,9 @@ def test_cube_size_follows_the_cost_of_factorisation(turned, degree):
             turn = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
             mesh.geometry.x[:] = mesh.geometry.x @ turn.T + 1e4
         space = fem.functionspace(mesh, ("Lagrange", degree, (3,)))
-        found = linear.cube_size(space, connected_bodies(space)[1], degree)
+        size = linear.cube_size(space, connected_bodies(space)[1], degree)
         work = nodes[:number] @ across[:number] ** 2 / nodes[:number].sum()
-        assert found == pytest.approx(3 * work ** (3 / 4), rel=1e-9)
+        assert size == pytest.approx(3 * work ** (3 / 4), rel=1e-9)
 
 
 def cube(size):
@@ -303,9 +303,9 @@ def test_small_cells_in_the_middle_increase_the_cube_size(graded):
     x = mesh.geometry.x[mesh.geometry.dofmap[: cells.size_local]]
     cut = np.sum((x.min(axis=1) < 0.0) & (x.max(axis=1) > 0.0), axis=0)
     section = COMM.allreduce(cut).min() * n / cells.size_global
-    found = linear.cube_size(space, connected_bodies(space)[1], 1)
-    assert found == pytest.approx(3 * section**1.5, rel=0.15)
-    assert (found > 1.5 * 3 * n) == graded
+    size = linear.cube_size(space, connected_bodies(space)[1], 1)
+    assert size == pytest.approx(3 * section**1.5, rel=0.15)
+    assert (size > 1.5 * 3 * n) == graded
 
 
 def test_solver_selection_depends_on_the_number_of_increments(monkeypatch):
@@ -329,7 +329,7 @@ def test_solver_selection_depends_on_the_number_of_increments(monkeypatch):
     # `increments` sets the number.
     for steps, condensed in ((1, False), (3, True)):
         problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
-        list(fc.increments(problem, lambda share: None, steps=steps))
+        list(fc.increments(problem, lambda t: None, steps=steps))
         assert problem.solver.condensed == condensed
 
 
@@ -353,14 +353,14 @@ def test_free_obstacle_is_solved_by_factorisation(caplog):
 def test_options_reach_the_multigrid_levels():
     """Options for nested solvers are applied, and do not remain in PETSc's database."""
     before = PETSc.Options().getAll()
-    made = BlockOnBall(
+    setup = BlockOnBall(
         method="lbfgs",
         linear_solver="multigrid",
         petsc_options={"mg_levels_pc_type": "jacobi", "mg_levels_ksp_max_it": 3},
         mesh={"n": 16},
     )
-    solve_path(made, path=PATH[:1])
-    smoother = made.problem.solver.equations.solvers[False].getPC().getMGSmoother(1)
+    solve_path(setup, path=PATH[:1])
+    smoother = setup.problem.solver.equations.solvers[False].getPC().getMGSmoother(1)
     assert smoother.getPC().getType() == "jacobi"
     assert smoother.getTolerances()[3] == 3
     assert PETSc.Options().getAll() == before
@@ -377,8 +377,8 @@ def test_memory_of_factors(cell, n, symmetric):
     scene = block(cell, n=n)
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers(), condensation=False)
     matrix = problem.full.stiffness.copy()
-    held = np.flatnonzero(problem.full.constrained).astype(np.int32)
-    matrix.zeroRowsColumns(held, diag=problem.full.bulk.scale)
+    constrained = np.flatnonzero(problem.full.constrained).astype(np.int32)
+    matrix.zeroRowsColumns(constrained, diag=problem.full.bulk.scale)
     matrix.shift(problem.full.bulk.scale * 1e-6)  # the height is not constrained
     matrix.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
     pc = PETSc.PC().create(COMM)
@@ -397,20 +397,20 @@ def test_monitors_are_kept_when_the_solver_is_replaced(monkeypatch):
     problem, _ = scene.problem(fc.Frictionless(), scene.rollers())
     monkeypatch.setattr(linear, "_MULTIGRID_SIZE", 0)
     monkeypatch.setattr(linear, "_SIZE_PER_INCREMENT", problem.full.size_to_factor / 2.5)
-    before, seen = problem.snes, []
+    before, monitored = problem.snes, []
 
     def watch(snes, iteration, norm, name, *, unit):
-        seen.append((iteration, norm, name, unit))
+        monitored.append((iteration, norm, name, unit))
 
     def count(snes, iteration, norm):
-        seen.append((iteration, norm, "count", 1))
+        monitored.append((iteration, norm, "count", 1))
 
     before.setMonitor(watch, ("a name",), {"unit": 2.0})
     before.setMonitor(count)
-    (step,) = fc.increments(problem, lambda share: None, steps=1)
+    (step,) = fc.increments(problem, lambda t: None, steps=1)
     assert problem.snes is not before and not problem.solver.condensed
     for name, unit in (("a name", 2.0), ("count", 1)):
-        iterations = [it for it, norm, n, u in seen if (n, u) == (name, unit)]
+        iterations = [it for it, norm, n, u in monitored if (n, u) == (name, unit)]
         assert len(iterations) > step.iterations > 0  # and at the start of a solve
 
 
@@ -429,10 +429,10 @@ def test_level_matrices_are_galerkin_products(cell):
     """
     n = 24 if cell == "triangle" else 8
     options = {"linear_solver": "multigrid", "condensation": False, "method": "lbfgs"}
-    made = BlockOnBall(cell=cell, mesh={"n": n}, **options)
-    solve_path(made, path=PATH)
-    assert made.problem.solver.equations.hierarchy.set_ups == 1
-    pc = made.problem.snes.getKSP().getPC()
+    setup = BlockOnBall(cell=cell, mesh={"n": n}, **options)
+    solve_path(setup, path=PATH)
+    assert setup.problem.solver.equations.hierarchy.set_ups == 1
+    pc = setup.problem.snes.getKSP().getPC()
     matrices, maps = levels_of(pc)
     assert len(maps) >= 1
     for fine, coarse, prolongation in zip(matrices[:-1], matrices[1:], maps, strict=True):
@@ -458,13 +458,13 @@ def test_finite_sliding_pairs_rebuild_the_levels(cell):
         contacts = [floor(body, law), joint(body, 1, law, kinematics="finite")]
         problem = fc.ContactProblem(body.F, body.u, contacts=contacts, method="lbfgs", **options)
         slips = []
-        for share in (0.0, 0.12, -0.1):
-            traction.value[[0, -1]] = 1e3 * share, -1e3
+        for factor in (0.0, 0.12, -0.1):
+            traction.value[[0, -1]] = 1e3 * factor, -1e3
             problem.solve()
             problem.commit()
             slips.append(contacts[1].resultants().slip)
         return nodal_values(body.u), np.array(slips)
 
-    direct, multigrid = both(make)
+    direct, multigrid = results_of_both_solvers(make)
     for by_factors, by_cycles in zip(direct, multigrid, strict=True):
         assert is_close(by_cycles, by_factors, SAME)

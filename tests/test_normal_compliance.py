@@ -47,8 +47,8 @@ def test_friction_bound_of_sliding_points(cell):
     scene = block(cell, E=E, nu=0.3, n=3)
     d = scene.dim
     push, press = (scene.dirichlet_bc(TOP, i) for i in (0, d - 1))
-    held = [scene.dirichlet_bc(TOP, 1)] if d == 3 else []
-    problem, contact = scene.problem(fc.NormalCompliance(MU, P0, H, 2.0), [push, press, *held])
+    bcs = [scene.dirichlet_bc(TOP, 1)] if d == 3 else []
+    problem, contact = scene.problem(fc.NormalCompliance(MU, P0, H, 2.0), [push, press, *bcs])
     for side in (0.0, 2e-2, -2e-2):
         push.g.value[...], press.g.value[...] = side, -1e-2
         step = problem.solve()
@@ -66,15 +66,15 @@ def test_friction_bound_of_sliding_points(cell):
 
 def test_solution_is_independent_of_units():
     """Approach and iterations are the same in N and mm, in N and µm, and with forces times 1e6."""
-    found = []
+    computed = []
     for force, length in ((1.0, 1.0), (1e6, 1.0), (1.0, 1e3)):
         stress = force / length**2
         scene = block(E=E * stress, nu=0.3, up=-3 * stress, size=[length, length])
         law = fc.NormalCompliance(MU, P0 * stress, H * length, 2.5)
         problem, contact = scene.problem(law, scene.rollers())
-        found.append((problem.solve().iterations, -gather(COMM, contact.gap) / length))
-    for iterations, delta in found[1:]:
-        assert iterations == found[0][0] and is_close(delta, found[0][1], EXACT)
+        computed.append((problem.solve().iterations, -gather(COMM, contact.gap) / length))
+    for iterations, delta in computed[1:]:
+        assert iterations == computed[0][0] and is_close(delta, computed[0][1], EXACT)
 
 
 def test_restarted_history_is_equal(tmp_path):
@@ -95,18 +95,18 @@ def test_invalid_parameters_are_refused():
         assert_raised_on_all_ranks(
             lambda m=m: fc.NormalCompliance(MU, P0, H, m), ValueError, "exponent"
         )
-    given = {"friction": MU, "pressure": P0, "approach": H}
+    parameters = {"friction": MU, "pressure": P0, "approach": H}
     for name in ("pressure", "approach"):
         for value in (0.0, -1.0):
-            law = fc.NormalCompliance(**given | {name: value})
+            law = fc.NormalCompliance(**parameters | {name: value})
             assert_raised_on_all_ranks(
                 lambda law=law: scene.contact(law), ValueError, "contact", name
             )
-        law = fc.NormalCompliance(**given | {name: fem.Constant(scene.mesh, -1.0)})
+        law = fc.NormalCompliance(**parameters | {name: fem.Constant(scene.mesh, -1.0)})
         assert_raised_on_all_ranks(
             lambda law=law: scene.problem(law, scene.rollers()), ValueError, "contact", name
         )
-    law = fc.NormalCompliance(**given)
+    law = fc.NormalCompliance(**parameters)
     assert_raised_on_all_ranks(
         lambda: scene.contact(law, enforcement="augmented"),
         ValueError,

@@ -39,8 +39,8 @@ def obstacles(mesh):
         ends = points[corners]
         edges = ends[:, 1] - ends[:, 0]
         along = np.einsum("pfi,fi->pf", x[:, None] - ends[:, 0], edges)
-        share = np.clip(along / np.sum(edges**2, axis=1), 0, 1)
-        off = x[:, None] - ends[:, 0] - share[:, :, None] * edges
+        fraction = np.clip(along / np.sum(edges**2, axis=1), 0, 1)
+        off = x[:, None] - ends[:, 0] - fraction[:, :, None] * edges
         return np.linalg.norm(off, axis=2).min(axis=1)
 
     t = np.linspace(0, 2 * np.pi, 60, endpoint=False)
@@ -70,27 +70,27 @@ def obstacles(mesh):
 def test_drawn_surface_in_the_plane(name):
     """All drawn points are on the surface, whose length in the box is known from a finer grid."""
     scene = block("triangle")
-    given = obstacles(scene.mesh)
-    obstacle, equation = given[name]
+    obstacle_list = obstacles(scene.mesh)
+    obstacle, equation = obstacle_list[name]
     kinematics = "finite" if name == "turned" else "small"
     contact = scene.contact(fc.Frictionless(1e3), obstacle=obstacle, kinematics=kinematics)
     if name == "turned":
-        given["_angle"][0].value = -np.pi / 2
+        obstacle_list["_angle"][0].value = -np.pi / 2
 
     def check():
         assert ObstacleShape.is_known(contact)
-        found = ObstacleShape(contact)(np.array([[0.0, 0.0], [1.0, 1.0]]))
-        assert len(found) > 20 and found.shape[1:] == (2, 2)
+        drawn = ObstacleShape(contact)(np.array([[0.0, 0.0], [1.0, 1.0]]))
+        assert len(drawn) > 20 and drawn.shape[1:] == (2, 2)
         # The corners of a polyline are cut off by up to a cell of the grid.
         allowed = 1 / 160 if name == "polyline" else FINE
-        assert np.abs(equation(found.reshape(-1, 2))).max() < allowed
+        assert np.abs(equation(drawn.reshape(-1, 2))).max() < allowed
         axis = np.linspace(0, 1, 401)
         grid = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
         if name != "polyline":  # its equation here has no sign
             values = equation(grid.reshape(-1, 2)).reshape(grid.shape[:2])
             lengths = [
                 np.linalg.norm(s[:, 1] - s[:, 0], axis=1).sum()
-                for s in (found, zero_level(grid, values))
+                for s in (drawn, zero_level(grid, values))
             ]
             assert is_close(lengths[0], lengths[1], 1e-2)
 
@@ -100,14 +100,14 @@ def test_drawn_surface_in_the_plane(name):
 @pytest.mark.parametrize("cell", ["tetrahedron", "hexahedron"])
 def test_drawn_surface_in_space(cell):
     """The part of a ball in the box has the area 2π R h of a cap of height h, to 1 %."""
-    made = BlockOnBall(cell=cell)
+    setup = BlockOnBall(cell=cell)
 
     def check():
         box = np.array([[-2.5, -2.5, -1.0], [3.5, 3.5, 5.0]])
-        found = ObstacleShape(made.contact)(box)
+        drawn = ObstacleShape(setup.contact)(box)
         middle = np.array([0.5, 0.5, -2.0])
-        assert np.abs(np.linalg.norm(found.reshape(-1, 3) - middle, axis=1) - 2.0).max() < 1e-2
-        edges = found[:, 1:] - found[:, :1]
+        assert np.abs(np.linalg.norm(drawn.reshape(-1, 3) - middle, axis=1) - 2.0).max() < 1e-2
+        edges = drawn[:, 1:] - drawn[:, :1]
         area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum() / 2
         assert is_close(area, 2 * np.pi * 2.0 * 1.0, 1e-2)
 
@@ -136,8 +136,8 @@ def test_magnified_displacement_and_previous_states():
         before = shape.state()
         displacement.value[1] = -0.02
         for state, depth in ((None, -0.4), (before, -0.2)):
-            found = shape(box, 20.0, state)[..., 1]
-            assert len(found) and np.abs(found - depth).max() < 1e-12
+            drawn = shape(box, 20.0, state)[..., 1]
+            assert len(drawn) and np.abs(drawn - depth).max() < 1e-12
 
     check_on_first_rank(check)
 
@@ -145,17 +145,17 @@ def test_magnified_displacement_and_previous_states():
 def test_obstacle_in_pictures_animations_and_files(tmp_path, monkeypatch):
     """A tool moves down on rubber: all outputs show it at its position at the time."""
     folder = shared_folder(tmp_path)
-    made = DiscOnRubber(law=fc.Frictionless(1e4))
+    setup = DiscOnRubber(law=fc.Frictionless(1e4))
     figures, save = [], drawing.save
     monkeypatch.setattr(drawing, "save", lambda f, path: (figures.append(f), save(f, path)))
-    writer = fc.Writer(folder / "files", made.problem)
-    film = fc.Animation(folder / "film.gif", made.problem)
-    for step in made.increments(1.0, steps=2):
+    writer = fc.Writer(folder / "files", setup.problem)
+    film = fc.Animation(folder / "film.gif", setup.problem)
+    for step in setup.increments(1.0, steps=2):
         writer.write(step)
         film.add(step)
     film.save()
-    fc.plotting.plot_deformation(folder / "u.png", made.contact.u, contacts=[made.contact])
-    fc.plotting.plot_status(folder / "status.png", made.contact)
+    fc.plotting.plot_deformation(folder / "u.png", setup.contact.u, contacts=[setup.contact])
+    fc.plotting.plot_status(folder / "status.png", setup.contact)
     COMM.barrier()
 
     def check():

@@ -28,7 +28,7 @@ def roller(scene, radius, shift, **options):
     return fc.Cylinder((0.0, scene.height + radius), radius, displacement=shift, **options)
 
 
-def level_set(scene, radius, *, true, shift):
+def cylinder_by_level_set(scene, radius, *, true, shift):
     """Return a cylinder as a level set, divided by the length of its gradient if ``true``."""
     top = scene.height + radius
 
@@ -49,7 +49,7 @@ def test_level_set_that_is_no_distance_is_refused(kinematics):
         shift = fem.Constant(scene.mesh, (0.0, -0.01))
         obstacle = roller(scene, radius, shift)
         if true is not None:
-            obstacle = level_set(scene, radius, true=true, shift=shift)
+            obstacle = cylinder_by_level_set(scene, radius, true=true, shift=shift)
         options = {"kinematics": kinematics}
         problem, contact = scene.problem(obstacle, fc.Coulomb(0.2), contact=options)
         if true is False:
@@ -88,16 +88,16 @@ def test_user_defined_obstacle_needs_distance_and_unit_normal(kinematics, wrong,
     The error is |1 - factor|, or 2 sin(angle/2).
     """
     forces = []
-    for own in (True, False):
+    for has_gradient in (True, False):
         scene = rubber(n=(12, 4), linear=True)
         shift, radius = fem.Constant(scene.mesh, (0.0, -0.01)), 2.0
         obstacle = roller(scene, radius, shift)
-        if own:
+        if has_gradient:
             obstacle = Roller((0.0, scene.height + radius), radius, shift, **wrong)
         problem, contact = scene.problem(
             obstacle, fc.Coulomb(0.2), contact={"kinematics": kinematics}
         )
-        if own and error is not None:
+        if has_gradient and error is not None:
             match = f"gap of the Roller differs by {error}"
             with pytest.raises(fc.NotConverged, match=match):
                 problem.solve()
@@ -194,12 +194,12 @@ def test_error_names_an_invalid_distance_function(distance, words, kinematics):
 def test_normals_and_axes_of_any_length(length):
     """Gaps agree to 1e-14 although squares of normals or axes overflow or underflow."""
     scene = block("tetrahedron")
-    for made in (
+    for obstacle in (
         lambda size: fc.HalfSpace((0, 0, -0.1), (0.0, -0.3 * size, 0.7 * size)),
         lambda size: fc.Cylinder((0.4, 0.5, -1.1), 1.0, axis=(size, 0.2 * size, 0.0)),
     ):
         gaps = [
-            gather(COMM, scene.contact(fc.Frictionless(), obstacle=made(size)).gap)
+            gather(COMM, scene.contact(fc.Frictionless(), obstacle=obstacle(size)).gap)
             for size in (1.0, length)
         ]
         assert is_close(gaps[1], gaps[0], 1e-14, scale=1.0)
@@ -220,9 +220,9 @@ def test_penetration_beyond_half_the_radius_is_refused():
 
     with pytest.raises(fc.NotConverged, match="half of the radius of curvature"):
         for _ in fc.increments(problem, load, 0.0, 0.9, steps=9, max_cuts=2):
-            found = contact.resultants()
-            forces.append(found.normal_force)
-            assert found.max_penetration <= 0.51 * radius
+            computed = contact.resultants()
+            forces.append(computed.normal_force)
+            assert computed.max_penetration <= 0.51 * radius
     assert len(forces) >= 3
     assert np.all(np.diff(forces) > 0)
 
@@ -353,11 +353,11 @@ def test_relative_stiffness_follows_a_modulus_set_later(linear):
     for first in (1000.0, 1.0):
         scene = block("quadrilateral", n=(6, 3), E=first)
         shift = fem.Constant(scene.mesh, (0.0, 0.01))
-        held = [scene.dirichlet_bc(TOP, i) for i in range(2)]
+        bcs = [scene.dirichlet_bc(TOP, i) for i in range(2)]
         law = {"displacement": shift}
         if not linear:
             scene.F = kirchhoff(scene)
-        problem, contact = scene.problem(fc.Coulomb(0.3), held, contact=law)
+        problem, contact = scene.problem(fc.Coulomb(0.3), bcs, contact=law)
         scene.E.value = 1000.0
         problem.solve()
         forces.append(contact.resultants().force)
@@ -366,24 +366,24 @@ def test_relative_stiffness_follows_a_modulus_set_later(linear):
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])
-@pytest.mark.parametrize("late", [False, True])
-def test_initial_displacement_is_the_slip_reference(kinematics, late):
+@pytest.mark.parametrize("set_afterwards", [False, True])
+def test_initial_displacement_is_the_slip_reference(kinematics, set_afterwards):
     """A body with an initial displacement along the plate, pressed straight down, does not slip.
 
-    Forces are those from u = 0, to 1e-6, the round-off of the displacement. With ``late`` the
-    displacement is set after creation of the problem.
+    Forces are those from u = 0, to 1e-6, the round-off of the displacement. With ``set_afterwards``
+    the displacement is set after creation of the problem.
     """
     forces = []
-    for aside in (0.0, 0.3):
+    for slide in (0.0, 0.3):
         scene = rubber(n=(8, 4), linear=True)
         plate = fc.HalfSpace((0.0, 1.0), (0.0, -1.0), displacement=(0.0, -0.001))
-        if late:
+        if set_afterwards:
             problem, contact = scene.problem(
                 plate, fc.Coulomb(0.2), contact={"kinematics": kinematics}
             )
         for field in (scene.u, scene.prescribed):
-            field.interpolate(lambda x, a=aside: np.array([a + 0 * x[0], 0 * x[0]]))
-        if not late:
+            field.interpolate(lambda x, a=slide: np.array([a + 0 * x[0], 0 * x[0]]))
+        if not set_afterwards:
             problem, contact = scene.problem(
                 plate, fc.Coulomb(0.2), contact={"kinematics": kinematics}
             )

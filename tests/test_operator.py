@@ -25,7 +25,7 @@ COMM = MPI.COMM_WORLD
 LAW = fc.Coulomb(0.3, k_n=1e7, k_t=1e6)
 
 
-def read(operator: ContactOperator) -> list[np.ndarray]:
+def operator_results(operator: ContactOperator) -> list[np.ndarray]:
     """Return results of an operator for fixed random states, tractions and stiffnesses."""
     rng = np.random.default_rng(COMM.rank)
     unknowns, n = operator.unknowns, operator.contact.quadrature.n_points
@@ -34,37 +34,41 @@ def read(operator: ContactOperator) -> list[np.ndarray]:
     force.set(0.0)
     operator.add_force(force, rng.normal(size=(n, gdim)))
     matrix = operator.springs(rng.normal(size=(n, gdim, gdim)))
-    found = [operator.jump(rng.normal(size=unknowns.n_local)), force.array_r.copy()]
-    found += [operator.coupled_dofs.copy(), *matrix.getValuesCSR()]
+    values = [operator.jump(rng.normal(size=unknowns.n_local)), force.array_r.copy()]
+    values += [operator.coupled_dofs.copy(), *matrix.getValuesCSR()]
     for item in (force, matrix):
         item.destroy()
-    return found
+    return values
 
 
-def same(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
+def are_equal(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
     """Return whether arrays are equal on all ranks."""
-    here = all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
-    return COMM.allreduce(here, op=MPI.LAND)
+    is_equal = all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+    return COMM.allreduce(is_equal, op=MPI.LAND)
 
 
 def test_operator_is_immutable():
     """No increment, restricted law or other operator changes it; updated pairs need another."""
     slider = SlidingBlock("triangle", LAW, start=1.0, n=(8, 3))
     contact, unknowns = slider.contact, slider.problem.full.unknowns
-    kept = np.arange(0, unknowns.n_dofs, 2, dtype=np.int32)
-    whole = ContactOperator(contact, unknowns)
-    part = ContactOperator(contact, DofSubset(unknowns, kept))
-    before = read(whole), read(part)
+    retained = np.arange(0, unknowns.n_dofs, 2, dtype=np.int32)
+    full = ContactOperator(contact, unknowns)
+    part = ContactOperator(contact, DofSubset(unknowns, retained))
+    before = operator_results(full), operator_results(part)
     slider.step(0.002, 0.0)
     contact.restrict_to(np.zeros(contact.quadrature.n_points, dtype=bool))
-    assert same(before[0], read(whole)) and same(before[1], read(part))
+    assert are_equal(before[0], operator_results(full)) and are_equal(
+        before[1], operator_results(part)
+    )
     contact.restrict_to()
     slider.step(0.002, 0.6)  # beyond the paired facets
     assert contact.contact_kinematics.updates_pairs
-    assert same(before[0], read(whole)) and same(before[1], read(part))
+    assert are_equal(before[0], operator_results(full)) and are_equal(
+        before[1], operator_results(part)
+    )
     another = ContactOperator(contact, unknowns)
-    assert not same(before[0], read(another))
-    assert same(before[0], read(whole))
+    assert not are_equal(before[0], operator_results(another))
+    assert are_equal(before[0], operator_results(full))
 
 
 def test_operators_on_different_dofs_are_independent():
@@ -75,13 +79,17 @@ def test_operators_on_different_dofs_are_independent():
         u, fc.ContactSurface(mesh, tags, UPPER_FACE), fc.DeformableBody(tags, LOWER_FACE), LAW
     )
     unknowns = Unknowns(u.function_space)
-    kept = np.arange(1, unknowns.n_dofs, 3, dtype=np.int32)
-    whole, part = (ContactOperator(contact, over) for over in (unknowns, DofSubset(unknowns, kept)))
-    alone = read(whole), read(part)
+    retained = np.arange(1, unknowns.n_dofs, 3, dtype=np.int32)
+    full, part = (
+        ContactOperator(contact, over) for over in (unknowns, DofSubset(unknowns, retained))
+    )
+    alone = operator_results(full), operator_results(part)
     u.interpolate(lambda x: np.vstack([0.1 * x[0], -0.2 * x[1]]))
     contact.evaluate()
     for _ in range(2):
-        assert same(alone[1], read(part)) and same(alone[0], read(whole))
+        assert are_equal(alone[1], operator_results(part)) and are_equal(
+            alone[0], operator_results(full)
+        )
 
 
 def test_updated_pairs_replace_the_operator_of_their_contact_only():
@@ -104,12 +112,14 @@ def test_updated_pairs_replace_the_operator_of_their_contact_only():
     before = system.operators
     assert all(a is b for a, b in zip(before, system.operators, strict=True))
     u.interpolate(lambda x: np.vstack([np.where(x[1] > 0.5, 0.3, 0.0), 0 * x[0]]))
-    old = read(before[0])
+    old = operator_results(before[0])
     pair.contact_kinematics.find_pairs(u, np.zeros(pair.quadrature.n_points))
     after = system.operators
     assert after[0] is not before[0] and after[1] is before[1]
     assert [operator.contact for operator in after] == [pair, floor]
-    assert not same(old, read(after[0])) and same(old, read(before[0]))
+    assert not are_equal(old, operator_results(after[0])) and are_equal(
+        old, operator_results(before[0])
+    )
 
 
 def test_matrix_in_3d_has_no_entries_for_open_points():

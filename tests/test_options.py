@@ -18,11 +18,11 @@ pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(120)]
 
 SCRIPT = """
 from scenes.block_on_ball import PATH, BlockOnBall
-made = BlockOnBall({arguments})
-made.set_top_displacement(*PATH[0])
-made.problem.solve()
-if made.problem.u.function_space.mesh.comm.rank == 0:
-    print("at most", made.problem.solver.main.max_it)
+setup = BlockOnBall({arguments})
+setup.set_top_displacement(*PATH[0])
+setup.problem.solve()
+if setup.problem.u.function_space.mesh.comm.rank == 0:
+    print("at most", setup.problem.solver.main.max_it)
 """
 
 
@@ -59,7 +59,7 @@ def test_values_of_options_are_parsed(command_line) -> None:
         *("-x", "--tb", "short", "-mine_snes_max_it", "7", "--mine_snes_max_it", "8", "mesh.msh"),
         *("-mine_number", "-1e-3", "-mine_snes_monitor", "-mine_own", "two words", "-mine_"),
     )
-    made = BlockOnBall(prefix="mine_")
+    setup = BlockOnBall(prefix="mine_")
     options = PETSc.Options()
     taken = {n: options.getString(n) for n in options.getAll() if n.startswith("mine_")}
     assert taken == {
@@ -69,7 +69,7 @@ def test_values_of_options_are_parsed(command_line) -> None:
         "mine_own": "two words",
     }
     assert not {"x", "tb"} & set(options.getAll())
-    assert made.problem.snes.getTolerances()[3] == 8
+    assert setup.problem.snes.getTolerances()[3] == 8
 
 
 def test_precedence_of_options(command_line) -> None:
@@ -79,9 +79,9 @@ def test_precedence_of_options(command_line) -> None:
     """
     command_line("-mine_snes_max_it", "7", "-mine_snes_type", "qn", "-snes_max_it", "9")
     PETSc.Options().setValue("mine_snes_type", "newtonls")
-    made = BlockOnBall(prefix="mine_", petsc_options={"snes_max_it": 8, "snes_type": "ngmres"})
-    assert made.problem.snes.getTolerances()[3] == 7
-    assert made.problem.snes.getType() == "newtonls"
+    setup = BlockOnBall(prefix="mine_", petsc_options={"snes_max_it": 8, "snes_type": "ngmres"})
+    assert setup.problem.snes.getTolerances()[3] == 7
+    assert setup.problem.snes.getType() == "newtonls"
     usual = BlockOnBall(prefix="").problem.snes.getTolerances()[3]
     assert usual == BlockOnBall().problem.snes.getTolerances()[3] != 9
 
@@ -111,8 +111,8 @@ def test_values_refused_by_petsc_are_named(command_line, message, name, value, w
 def test_command_line_of_first_rank_is_used_on_all_ranks(command_line) -> None:
     """If the ranks have different command lines, that of the first rank is used."""
     command_line("-mine_snes_max_it", str(7 + COMM.rank))
-    made = BlockOnBall(prefix="mine_")
-    assert set(COMM.allgather(made.problem.snes.getTolerances()[3])) == {7}
+    setup = BlockOnBall(prefix="mine_")
+    assert set(COMM.allgather(setup.problem.snes.getTolerances()[3])) == {7}
 
 
 GOOD = {
@@ -139,12 +139,12 @@ def test_unused_options_are_named(command_line, method, condensation, caplog) ->
     for name, value in GOOD.items():
         line += [f"-mine_{name}", *([] if value is None else [str(value).lower()])]
     command_line(*line)
-    given = {"snes_maxit": 3, "snes_force_iteration": False}
-    made = BlockOnBall(
-        prefix="mine_", method=method, condensation=condensation, petsc_options=given
+    database = {"snes_maxit": 3, "snes_force_iteration": False}
+    setup = BlockOnBall(
+        prefix="mine_", method=method, condensation=condensation, petsc_options=database
     )
     with caplog.at_level("WARNING", logger="fenics_contact"):
-        solve_path(made)
+        solve_path(setup)
     message = [r.message for r in caplog.records if "unused options" in r.message]
     assert len(message) == (COMM.rank == 0)
     if message:

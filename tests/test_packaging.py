@@ -45,7 +45,7 @@ def test_linter_version_is_the_same_everywhere() -> None:
 def test_recipe_has_the_dependencies_of_the_package() -> None:
     """The recipe has the dependencies of the package, by the same names, and a real PETSc."""
     run = re.search(r"\n  run:\n(.*?)\n\n", RECIPE, re.DOTALL).group(1)
-    wanted = re.findall(r"^    - (.*)$", run, re.MULTILINE)
-    assert wanted[0] == "python >=${{ python_min }}" and wanted[-1] == "petsc * real_*"
-    assert sorted(map(name_and_bound, wanted[1:-1])) == DEPENDENCIES
+    listed = re.findall(r"^    - (.*)$", run, re.MULTILINE)
+    assert listed[0] == "python >=${{ python_min }}" and listed[-1] == "petsc * real_*"
+    assert sorted(map(name_and_bound, listed[1:-1])) == DEPENDENCIES
     assert f'python_min: "{PYTHON}"' in RECIPE

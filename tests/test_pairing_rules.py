@@ -37,24 +37,24 @@ def _assert_warning(expected, *words):
         warnings.simplefilter("always")
         yield
     texts = [str(w.message) for w in caught if "opposite" in str(w.message)]
-    found = bool(texts) and all(word in texts[0] for word in words)
-    assert all(flag == expected for flag in COMM.allgather(found)), texts
+    is_reported = bool(texts) and all(word in texts[0] for word in words)
+    assert all(flag == expected for flag in COMM.allgather(is_reported)), texts
 
 
 # ---- opposite facets ----------------------------------------------------------------------------
 
 
-def plates(cell, thickness, apart, *, layers=2, bend=None, degree=1):
+def plates(cell, thickness, gap, *, layers=2, bend=None, degree=1):
     """Return axes and tags of plates of length 1 stacked vertically, tops and bottoms in BOTH."""
     d = 3 if cell in ("tetrahedron", "hexahedron") else 2
     axes, flats, low = [], [], 0.0
     counts = (6, 9, 7)
-    for j in range(len(apart) + 1):
+    for j in range(len(gap) + 1):
         high = low + thickness
         line = np.linspace(0, 1, counts[j] + 1)
         axes.append([line] * (d - 1) + [np.linspace(low, high, layers + 1)])
         flats += [low, high]
-        low = high + (apart[j] if j < len(apart) else 0.0)
+        low = high + (gap[j] if j < len(gap) else 0.0)
     marks = {BOTH: any_of(*(at_coordinate(d - 1, v) for v in flats))}
     for j in range(len(axes)):
         marks[10 * j + LOWER] = at_interface(d - 1, flats[2 * j + 1], above=False)
@@ -118,8 +118,8 @@ def test_three_plates_in_one_tag(cell):
     body = Bodies(boxes(axes, {BOTH: marks[BOTH], SIDES: ends}, simplex=cell == "triangle"), E, 0.0)
     space = body.u.function_space
     low = dolfinx.mesh.locate_entities_boundary(body.mesh, d - 1, lambda x: np.abs(x[d - 1]) < 1e-9)
-    still = fem.locate_dofs_topological(space.sub(d - 1), d - 1, low)
-    body.bcs = [fem.dirichletbc(body.constant(0.0), still, space.sub(d - 1))]
+    fixed_dofs = fem.locate_dofs_topological(space.sub(d - 1), d - 1, low)
+    body.bcs = [fem.dirichletbc(body.constant(0.0), fixed_dofs, space.sub(d - 1))]
     body.prescribe(SIDES, *range(d - 1))
     top = ufl.conditional(ufl.gt(body.x[d - 1], 0.06 - 1e-9), 1.0, 0.0)
     body.F += q * top * body.v[d - 1] * body.ds(BOTH)
@@ -172,10 +172,10 @@ def cut_square(n, opening):
         [number[i : n + i, j : n + j].ravel() for i in range(2) for j in range(2)]
     )
     cut = np.flatnonzero((np.abs(x[:, 1]) < 1e-12) & (x[:, 0] > 1e-12))
-    twin = np.arange(len(x))
-    twin[cut] = len(x) + np.arange(len(cut))
+    duplicate = np.arange(len(x))
+    duplicate[cut] = len(x) + np.arange(len(cut))
     above = x[cells].mean(axis=1)[:, 1] > 0
-    cells[above] = twin[cells[above]]
+    cells[above] = duplicate[cells[above]]
     x = np.concatenate([x, x[cut] + np.column_stack([0 * cut, opening * x[cut, 0]])])
     mesh = create_mesh("quadrilateral", x, cells)
 
@@ -236,7 +236,7 @@ def test_soft_contact_keeps_its_pairs():
 # ---- points without an opposite point ------------------------------------------------------------
 
 
-def overhang(cell, law, *, tags=(LOWER,), gap=-0.01, **options):
+def overhanging_block(cell, law, *, tags=(LOWER,), gap=-0.01, **options):
     """Set up a slab of width 1 on a pillar of 0.6, both clamped, with an interference of 0.01."""
     body = stack(cell, (5, 8), (0.5, 0.25), widths=[0.6, 1.0], nu=0.3)
     body.prescribe(FLOOR, *range(body.d))
@@ -279,7 +279,7 @@ def test_prescribed_gap_at_an_overhang(cell, name, enforcement):
     law = LAWS[name]
     if enforcement == "augmented" and (law.is_physical or cell == "hexahedron"):
         pytest.skip("no multipliers for a physical layer; once is enough")
-    body, contact, outside = overhang(cell, law, enforcement=enforcement)
+    body, contact, outside = overhanging_block(cell, law, enforcement=enforcement)
     problem = body.problem(contact)
     for lift in (-0.002, 0.001):
         body.lift.value = lift
@@ -312,7 +312,7 @@ def test_prescribed_gap_at_an_overhang(cell, name, enforcement):
 def test_files_mark_points_without_an_opposite_point(cell, tmp_path):
     """Where "paired" is 0, files have no gap (NaN), no pressure and the status open."""
     folder = shared_folder(tmp_path)
-    body, contact, outside = overhang(cell, fc.Coulomb(0.3, 1e7, 1e7))
+    body, contact, outside = overhanging_block(cell, fc.Coulomb(0.3, 1e7, 1e7))
     problem = body.problem(contact)
     problem.solve()
     fc.Writer(folder, problem).write(1)
@@ -321,18 +321,18 @@ def test_files_mark_points_without_an_opposite_point(cell, tmp_path):
     assert np.count_nonzero(alone) == np.count_nonzero(outside)
     assert np.array_equal(np.isnan(points["gap"][:, 0]), alone)
     facets = vtu.read_vtu(folder / "joint 1_0000.vtu")
-    share = facets.in_cells["paired"]
-    assert np.array_equal(np.isnan(facets.at_nodes["gap"]).all(axis=1), share == 0.0)
-    assert np.isfinite(facets.at_nodes["gap"][share > 0.0]).all()
-    assert np.all(facets.at_nodes["pressure"][share == 0.0] == 0.0)
-    assert np.all(facets.in_cells["status"][share == 0.0] == fc.Status.OPEN)
+    paired_fraction = facets.in_cells["paired"]
+    assert np.array_equal(np.isnan(facets.at_nodes["gap"]).all(axis=1), paired_fraction == 0.0)
+    assert np.isfinite(facets.at_nodes["gap"][paired_fraction > 0.0]).all()
+    assert np.all(facets.at_nodes["pressure"][paired_fraction == 0.0] == 0.0)
+    assert np.all(facets.in_cells["status"][paired_fraction == 0.0] == fc.Status.OPEN)
     assert facets.at_nodes["pressure"].min() == 0.0 < facets.at_nodes["pressure"].max()
-    assert 0 < np.count_nonzero(share == 0.0) < len(share)
+    assert 0 < np.count_nonzero(paired_fraction == 0.0) < len(paired_fraction)
 
 
 def test_tractions_of_unpaired_points_violate_the_laws():
     """A traction at a point without an opposite point violates complementarity."""
-    _, contact, _ = overhang("triangle", fc.Frictionless(1e7))
+    _, contact, _ = overhanging_block("triangle", fc.Frictionless(1e7))
     contact.evaluate()
     assert check_laws(contact)["complementarity"] <= 1e-12
     contact.values.normal_traction[~contact.paired] = -1.0
@@ -354,19 +354,19 @@ def test_warning_states_number_and_cause_of_unpaired_points():
     body = Bodies(boxes(axes, sides), E, 0.3)
     law = fc.Frictionless(1e6)
 
-    def made(here, there, **options):
-        return body.contact(here, fc.DeformableBody(body.tags, there, **options), law)
+    def make_contact(slave, master, **options):
+        return body.contact(slave, fc.DeformableBody(body.tags, master, **options), law)
 
     with _assert_warning(False):
-        assert made(UPPER, LOWER).n_unpaired == 0
-    for here, there, options, word in (
+        assert make_contact(UPPER, LOWER).n_unpaired == 0
+    for slave, master, options, word in (
         (UPPER, LOWER, {"search_distance": 0.05}, "search_distance"),
         (UPPER, ROOF, {}, "own body"),
         (LOWER, ROOF, {}, "do not meet"),
         (ROOF, FLOOR, {}, "behind"),
     ):
         with _assert_warning(True, "16 of the 16 points", word):
-            assert made(here, there, **options).n_unpaired == 16
+            assert make_contact(slave, master, **options).n_unpaired == 16
 
 
 # ---- penetration between the points --------------------------------------------------------------
@@ -406,8 +406,8 @@ def indented_block(cell, width, depth, *, coarse=2, swap=False, both=False, rais
     faces = [(UPPER, LOWER)] if swap else [(LOWER, UPPER)]
     faces += [(UPPER, LOWER)] if both else []
     contacts = [
-        body.contact(here, there, fc.Frictionless(), name=f"side {i}", quadrature=2)
-        for i, (here, there) in enumerate(faces)
+        body.contact(slave, master, fc.Frictionless(), name=f"side {i}", quadrature=2)
+        for i, (slave, master) in enumerate(faces)
     ]
     return body, contacts, body.problem(*contacts)
 
@@ -525,8 +525,8 @@ def test_any_ratio_of_mesh_sizes_is_verified(counts, swap):
     body.bcs.append(fem.dirichletbc(top, dofs, spaces[0]))
     contact = joint(body, 1, fc.Coulomb(0.3), swap=swap)
     problem = body.problem(contact)
-    for share in (0.5, 1.0):
-        top.interpolate(lambda x, share=share: share * 0.01 * (x[0] - 0.4))
+    for load_factor in (0.5, 1.0):
+        top.interpolate(lambda x, load_factor=load_factor: load_factor * 0.01 * (x[0] - 0.4))
         step = problem.solve()
         problem.commit()
         assert undetected(step) == []
@@ -542,8 +542,8 @@ def test_faceting_of_curved_surfaces_is_accepted(counts, swap, degree):
     body.prescribe(FLOOR, 0, 1)
     squeeze = body.constant(0.0)
     body.F += squeeze * ufl.dot(ufl.FacetNormal(body.mesh), body.v) * body.ds(OUTSIDE)
-    here, there = (UPPER, LOWER) if swap else (LOWER, UPPER)
-    contact = body.contact(here, there, fc.Coulomb(0.3))
+    slave, master = (UPPER, LOWER) if swap else (LOWER, UPPER)
+    contact = body.contact(slave, master, fc.Coulomb(0.3))
     assert TunnellingCheck([contact]).evaluate(None)["contact"].place is None
     problem = body.problem(contact)
     for load in (1.0, 1e3):

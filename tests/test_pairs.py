@@ -132,13 +132,13 @@ def test_surface_with_a_body_and_a_rigid_obstacle():
     body.prescribe(SIDES, 0)
     body.F += q * body.v[1] * body.ds(ROOF)
     pair = joint(body, 1, fc.Frictionless(k_1))
-    rest = fc.Contact(
+    remaining_contact = fc.Contact(
         body.u, pair.surface, fc.HalfSpace((0, 0.5), (0, 1)), fc.Frictionless(k_2), name="rest"
     )
-    body.problem(pair, rest).solve()
+    body.problem(pair, remaining_contact).solve()
     series = 1 / (1 / k_1 + 0.5 / E)
     assert is_uniform(pair.pressure, q * series / (series + k_2))
-    assert is_uniform(rest.pressure, q * k_2 / (series + k_2))
+    assert is_uniform(remaining_contact.pressure, q * k_2 / (series + k_2))
 
 
 def test_symmetric_contacts_have_half_of_the_pressure_each():
@@ -240,16 +240,16 @@ def test_pairs_are_updated_only_in_the_sliding_joint():
     """Pairs are updated in one joint alone, while it slides over three facets with T = μN, 1e-8."""
     q = 5e3
     body = stack("quadrilateral", (8, 16, 5), (0.3, 0.2, 0.2), widths=[1.0, 1.0, 0.4], nu=0.3)
-    drag = body.constant(0.0)
+    slide = body.constant(0.0)
     body.prescribe(FLOOR, 0, 1)
-    body.prescribe(ROOF, 0, value=drag)
+    body.prescribe(ROOF, 0, value=slide)
     body.F += q * body.v[1] * body.ds(ROOF)
     glued = joint(body, 1, fc.Coulomb(0.5, k_n=1e7, k_t=1e7))
     obstacle = fc.DeformableBody(body.tags, 20 + LOWER, update_pairs="increment")
     slides = body.contact(20 + UPPER, obstacle, fc.Coulomb(0.2, k_n=1e7, k_t=1e7), name="slides")
     problem = body.problem(glued, slides)
     n = 0.4 * q
-    for step in fc.increments(problem, drag, 0.0, 0.2, steps=10):
+    for step in fc.increments(problem, slide, 0.0, 0.2, steps=10):
         r = step.contacts["slides"]
         assert is_close(r.normal_force, n, 1e-8)
         assert r.stick == 0

@@ -69,7 +69,7 @@ class SlidingPair:
         return self.contact.resultants().normal_force
 
 
-def on_cantilever(start, law=None, unrelated=(), *, load=-LOAD, clearance=0.0, **options):
+def pair_on_cantilever(start, law=None, unrelated=(), *, load=-LOAD, clearance=0.0, **options):
     """Set up a block on a cantilever of length 10, with a vertical traction or a clearance."""
     boxes = {
         "beam": Box((0.0, 0.0), (10.0, HEIGHT), (80, 4)),
@@ -87,21 +87,21 @@ def on_cantilever(start, law=None, unrelated=(), *, load=-LOAD, clearance=0.0, *
     return SlidingPair(scene, along, scene.contact("block", BOTTOM, ("beam", TOP), law, **options))
 
 
-def moment(pair):
+def reaction_moment(pair):
     """Return the moment of the clamp's reactions about the origin: their work on a rotation."""
     bodies, space = pair.scene.bodies, pair.scene.bodies.u.function_space
     rotation = fem.Function(space)
     rotation.interpolate(lambda x: np.array([-x[1], x[0]]))
     facets = bodies.tags.find(pair.scene.tag("beam", LEFT))
-    held = fem.locate_dofs_topological(space, 1, facets)
+    constrained = fem.locate_dofs_topological(space, 1, facets)
     only = fem.Function(space)
-    dofs = (2 * held[:, None] + np.arange(2)).ravel()
+    dofs = (2 * constrained[:, None] + np.arange(2)).ravel()
     only.x.array[dofs] = rotation.x.array[dofs]
     only.x.scatter_forward()
     return assemble_scalar(compile_with_maps(ufl.replace(bodies.F, {bodies.v: only})), COMM)
 
 
-def on_slab(start, law=None, unrelated=(), *, width=3.0, soft=1.0, spring=None, **options):
+def pair_on_slab(start, law=None, unrelated=(), *, width=3.0, soft=1.0, spring=None, **options):
     """Set up a block on a slab that may be softer beyond x = 1.5; its top is lowered by 0.002.
 
     The horizontal displacement is prescribed at its top, or at the end of a spring on its top.
@@ -133,21 +133,23 @@ def test_clamp_moment_of_a_load_sliding_on_a_cantilever(steps, enforcement):
     Reference: statics, 1e-4. The pairs are those at most a hundredth of a facet from the end, or
     1.6e-4 of the arm, on both sides of it. Those at the start would give 15 % of the moment.
     """
-    pair = on_cantilever(1.0, enforcement=enforcement).press()
-    assert moment(pair) == pytest.approx(LOAD * WIDTH * (1.0 + WIDTH / 2), rel=1e-6)
+    pair = pair_on_cantilever(1.0, enforcement=enforcement).press()
+    assert reaction_moment(pair) == pytest.approx(LOAD * WIDTH * (1.0 + WIDTH / 2), rel=1e-6)
     pair.slide_by(7.0, steps)
     assert pair.force == pytest.approx(LOAD * WIDTH, rel=1e-6)
-    assert moment(pair) == pytest.approx(LOAD * WIDTH * (8.0 + WIDTH / 2), rel=1e-4)
+    assert reaction_moment(pair) == pytest.approx(LOAD * WIDTH * (8.0 + WIDTH / 2), rel=1e-4)
 
 
 @pytest.mark.parametrize("unrelated", UNRELATED_BODIES)
 def test_slide_with_an_unrelated_body(unrelated):
     """An unrelated body changes neither the moment nor the contact force, to 1e-6."""
-    pair = on_cantilever(1.0, fc.Coulomb(0.2)).press()
+    pair = pair_on_cantilever(1.0, fc.Coulomb(0.2)).press()
     pair.slide_by(7.0)
-    other = on_cantilever(1.0, fc.Coulomb(0.2), unrelated=[UNRELATED_BODIES[unrelated]]).press()
+    other = pair_on_cantilever(
+        1.0, fc.Coulomb(0.2), unrelated=[UNRELATED_BODIES[unrelated]]
+    ).press()
     other.slide_by(7.0)
-    assert moment(other) == pytest.approx(moment(pair), rel=1e-6)
+    assert reaction_moment(other) == pytest.approx(reaction_moment(pair), rel=1e-6)
     assert is_close(other.contact.resultants().force, pair.contact.resultants().force, 1e-6)
 
 
@@ -160,9 +162,11 @@ def test_slide_from_stiff_to_soft_slab(slide, steps):
     the undeformed surface and the block stands across a step of the stiffness. The nodes of both
     surfaces coincide there, so that both scenes have the same mesh.
     """
-    pair = on_slab(0.25, soft=1e-2).press()
+    pair = pair_on_slab(0.25, soft=1e-2).press()
     pair.slide_by(slide, steps)
-    assert pair.force == pytest.approx(on_slab(0.25 + slide, soft=1e-2).press().force, rel=0.02)
+    assert pair.force == pytest.approx(
+        pair_on_slab(0.25 + slide, soft=1e-2).press().force, rel=0.02
+    )
 
 
 @pytest.mark.parametrize("gap", [None, 0.0])
@@ -170,38 +174,38 @@ def test_slide_from_stiff_to_soft_slab(slide, steps):
 def test_slide_from_an_overhang_onto_the_slab(steps, gap):
     """An overhanging block (7/8) is moved onto the slab: the force of one meshed there, 0.5 %."""
     options = {} if gap is None else {"gap": gap}
-    pair = on_slab(-0.875, **options).press()
+    pair = pair_on_slab(-0.875, **options).press()
     pair.slide_by(1.25, steps)
-    assert pair.force == pytest.approx(on_slab(0.375).press().force, rel=5e-3)
+    assert pair.force == pytest.approx(pair_on_slab(0.375).press().force, rel=5e-3)
 
 
 def test_repeated_solves_give_the_same_solution():
     """An increment solved twice, or after a failed solve, has the solution of a single solve."""
-    once = on_slab(0.25, fc.Coulomb(0.3), soft=1e-2).press()
+    once = pair_on_slab(0.25, fc.Coulomb(0.3), soft=1e-2).press()
     once.along.value = 0.5
     once.problem.solve()
     once.problem.commit()
-    again = on_slab(0.25, fc.Coulomb(0.3), soft=1e-2).press()
-    again.along.value = 0.9
-    again.problem.solve()
-    again.along.value = 0.5
+    repeated = pair_on_slab(0.25, fc.Coulomb(0.3), soft=1e-2).press()
+    repeated.along.value = 0.9
+    repeated.problem.solve()
+    repeated.along.value = 0.5
     with pytest.warns(UserWarning, match="not committed"):
-        again.problem.solve()
-    state = again.contact.values.jump.copy()
-    number = again.contact.pairs.n_updates
-    again.along.value = 1.0
-    again.problem.small_displacement_tolerance = 0.0
-    assert_raised_on_all_ranks(again.problem.solve, fc.NotConverged)
-    again.problem.small_displacement_tolerance = 0.2
-    assert again.contact.pairs.n_updates > number
-    assert is_close(again.contact.contact_kinematics.present_jump(), state, 1e-12)
-    again.problem.commit()
-    for pair in (once, again):
+        repeated.problem.solve()
+    state = repeated.contact.values.jump.copy()
+    number = repeated.contact.pairs.n_updates
+    repeated.along.value = 1.0
+    repeated.problem.small_displacement_tolerance = 0.0
+    assert_raised_on_all_ranks(repeated.problem.solve, fc.NotConverged)
+    repeated.problem.small_displacement_tolerance = 0.2
+    assert repeated.contact.pairs.n_updates > number
+    assert is_close(repeated.contact.contact_kinematics.present_jump(), state, 1e-12)
+    repeated.problem.commit()
+    for pair in (once, repeated):
         pair.along.value = 0.75
         pair.problem.solve()
-    assert is_close(again.contact.resultants().force, once.contact.resultants().force, 1e-8)
-    again.problem.restore()
-    assert is_close(again.contact.resultants().force, state_of(once), 1e-8)
+    assert is_close(repeated.contact.resultants().force, once.contact.resultants().force, 1e-8)
+    repeated.problem.restore()
+    assert is_close(repeated.contact.resultants().force, state_of(once), 1e-8)
 
 
 def solutions_of(step):
@@ -217,7 +221,7 @@ def test_increments_with_predicted_pairs_need_one_solve(spring):
     """
 
     def make():
-        return on_slab(0.25, fc.Coulomb(0.2), spring=spring).press()
+        return pair_on_slab(0.25, fc.Coulomb(0.2), spring=spring).press()
 
     pair, numbers = make(), []
     for slide in (0.1, 0.25, 0.4, 0.5, 0.65, 0.7, 0.55):
@@ -235,7 +239,7 @@ def test_increments_with_predicted_pairs_need_one_solve(spring):
     assert is_close(pair.contact.resultants().force, fewer.contact.resultants().force, 1e-3)
 
 
-def between_walls(law, displacements, downs, start=0.5, *, loaded=False, **options):
+def push_by_walls(law, displacements, downs, start=0.5, *, loaded=False, **options):
     """Push a block along a slab of length 4 by walls, one increment for each displacement.
 
     The vertical displacement of its top is prescribed, or a traction (``loaded``).
@@ -278,9 +282,9 @@ def test_wrong_pair_prediction_keeps_contact_forces(law, sign):
     Reference: the block meshed at its end position, 1e-3.
     """
     downs = -sign * np.linspace(2e-3, 2.4e-3, 5)
-    found, _ = between_walls(law, (0.0, 0.3, 2.4, 2.3, 2.2), downs, gap=0.0)
-    there, _ = between_walls(law, (0.0,), downs[3:4], start=2.8, gap=0.0)
-    assert is_close(found[3], there[0], 1e-3)
+    computed, _ = push_by_walls(law, (0.0, 0.3, 2.4, 2.3, 2.2), downs, gap=0.0)
+    reference, _ = push_by_walls(law, (0.0,), downs[3:4], start=2.8, gap=0.0)
+    assert is_close(computed[3], reference[0], 1e-3)
 
 
 def test_failed_pair_prediction_costs_one_attempt():
@@ -288,7 +292,7 @@ def test_failed_pair_prediction_costs_one_attempt():
 
     The committed pairs are used after one attempt: 23 iterations in total instead of 604.
     """
-    _, steps = between_walls(
+    _, steps = push_by_walls(
         fc.Coulomb(0.2), (0.0, 0.3, 2.3, 2.0), (-200.0, -210.0, -220.0, -230.0), loaded=True
     )
     assert sum("predicted" in attempt.outcome for attempt in steps[3].attempts) == 1
@@ -301,24 +305,24 @@ def test_block_leaves_the_slab_and_returns(law):
 
     As the gap is prescribed, no distance indicates the return; an earlier version had no force.
     """
-    pair = on_slab(0.25, law, gap=0.0).press()
+    pair = pair_on_slab(0.25, law, gap=0.0).press()
     for slide in (0.2, 1.4, 3.6, 1.4):
         pair.along.value = slide
         pair.problem.solve()
         pair.problem.commit()
         if slide == 3.6:
             assert pair.force == 0.0
-    there = on_slab(0.25 + 1.4, law, gap=0.0).press()
-    assert pair.force == pytest.approx(there.force, rel=2e-3)
+    reference = pair_on_slab(0.25 + 1.4, law, gap=0.0).press()
+    assert pair.force == pytest.approx(reference.force, rel=2e-3)
 
 
 def test_unrelated_body_does_not_change_predicted_pairs():
     """A moving unrelated body changes the force of a resting block by 1e-6 at most, not by 1e-4."""
     forces = []
     for unrelated in ([], [UNRELATED_BODIES["sliding"]]):
-        pair = on_slab(0.25, fc.Coulomb(0.3), unrelated).press()
-        for share, slide in ((1.0, 0.5), (1.5, 1.0), (2.0, 1.0)):
-            pair.scene.set_unrelated_load(share)
+        pair = pair_on_slab(0.25, fc.Coulomb(0.3), unrelated).press()
+        for factor, slide in ((1.0, 0.5), (1.5, 1.0), (2.0, 1.0)):
+            pair.scene.set_unrelated_load(factor)
             pair.along.value = slide
             pair.problem.solve()
             pair.problem.commit()
@@ -336,12 +340,12 @@ def state_of(pair):
 def test_interrupted_history_continues(field, tmp_path):
     """A history interrupted between increments of a few facets of slip has the same force, 1e-9."""
     path = COMM.bcast(tmp_path / "state")
-    whole = on_slab(0.25, fc.Coulomb(0.3), soft=0.1).press()
+    uninterrupted = pair_on_slab(0.25, fc.Coulomb(0.3), soft=0.1).press()
     options = {"recover_interior": field}
-    list(fc.increments(whole.problem, whole.along, 0.0, 1.5, steps=3, **options))
+    list(fc.increments(uninterrupted.problem, uninterrupted.along, 0.0, 1.5, steps=3, **options))
 
     def make():
-        return on_slab(0.25, fc.Coulomb(0.3), soft=0.1)
+        return pair_on_slab(0.25, fc.Coulomb(0.3), soft=0.1)
 
     def load(pair):
         def to(t):
@@ -354,9 +358,11 @@ def test_interrupted_history_continues(field, tmp_path):
     for _ in range(3):
         next(steps)
     steps.close()
-    again = make()
-    list(fc.increments(again.problem, load(again), 0.0, 4.0, steps=4, checkpoint=path, **options))
-    forces = [pair.contact.resultants().force for pair in (again, whole)]
+    resumed = make()
+    list(
+        fc.increments(resumed.problem, load(resumed), 0.0, 4.0, steps=4, checkpoint=path, **options)
+    )
+    forces = [pair.contact.resultants().force for pair in (resumed, uninterrupted)]
     assert is_close(*forces, 1e-9)
 
 
@@ -364,7 +370,7 @@ def test_fixed_pairs_fail_beyond_a_facet_of_slip():
     """With update_pairs="never" slip beyond a facet fails; if accepted, forces do not move."""
 
     def make():
-        pair = on_cantilever(1.0)
+        pair = pair_on_cantilever(1.0)
         obstacle = fc.DeformableBody(
             pair.scene.bodies.tags, pair.scene.tag("beam", TOP), update_pairs="never"
         )
@@ -379,7 +385,7 @@ def test_fixed_pairs_fail_beyond_a_facet_of_slip():
     pair.problem.small_displacement_tolerance = np.inf
     pair.problem.solve()
     pair.problem.commit()
-    assert moment(pair) == pytest.approx(LOAD * WIDTH * (1.0 + WIDTH / 2), rel=1e-6)
+    assert reaction_moment(pair) == pytest.approx(LOAD * WIDTH * (1.0 + WIDTH / 2), rel=1e-6)
 
 
 def test_resting_contact_keeps_its_pairs_while_another_slides():
@@ -426,21 +432,21 @@ def random_slide(seed):
     scene = sliding_scenes.draw(seed, without=left_out, family=seed // 24)
     body, contact = scene["bodies"][1], scene["contacts"][0]
     clearance = body["origin"][-1] - scene["bodies"][0]["size"][-1]
-    share = min(1.0, 1e-3 / scene["strain"])
-    body["origin"][-1] -= (1.0 - share) * clearance
+    scale = min(1.0, 1e-3 / scene["strain"])
+    body["origin"][-1] -= (1.0 - scale) * clearance
     contact["law"] = {"kind": "frictionless", "k_n": contact["law"]["k_n"]}
     contact["obstacle"]["update_pairs"] = "auto"
-    scene |= {"strain": share * scene["strain"], "drive": "prescribed", "cuts": 5}
+    scene |= {"strain": scale * scene["strain"], "drive": "prescribed", "cuts": 5}
     scene["dirichlet"][1][2] = list(range(len(body["size"])))
     for each in scene["bodies"]:
         each["jitter"] = 0
     last = scene["stages"][-1] | {"steps": 1, "normal": 1.0}
     scene["stages"][-1]["normal"] = 1.0
-    there = copy.deepcopy(scene)
+    scene_at_end = copy.deepcopy(scene)
     for i, slide in enumerate(("side", "across")[: len(body["size"]) - 1]):
-        there["bodies"][1]["origin"][i] += last[slide] * body["size"][i]
-    there["stages"] = [last | {"side": 0.0, "across": 0.0}]
-    return scene, there
+        scene_at_end["bodies"][1]["origin"][i] += last[slide] * body["size"][i]
+    scene_at_end["stages"] = [last | {"side": 0.0, "across": 0.0}]
+    return scene, scene_at_end
 
 
 @pytest.mark.parametrize("seed", range(5120, 5360, 5))
@@ -449,12 +455,12 @@ def test_force_after_random_slides(seed):
 
     The tolerance is for strains of 1e-3, and for facets covered where a block ends near a node.
     """
-    found = []
+    computed = []
     for scene in random_slide(seed):
         records = []
         run_history(scene, COMM, records.append, setup_class=SmallSetup)
-        found.append(records[-1]["contacts"][0]["force"])
-    assert is_close(*found, 0.02)
+        computed.append(records[-1]["contacts"][0]["force"])
+    assert is_close(*computed, 0.02)
 
 
 @pytest.mark.parametrize(
@@ -462,9 +468,9 @@ def test_force_after_random_slides(seed):
 )
 def test_tensile_forces_slide_with_the_block(law):
     """Tensile forces move with the block: moment by statics, 1e-4 (15 % of it at the start)."""
-    pair = on_cantilever(1.0, law, load=LOAD, gap=0.0).press()
+    pair = pair_on_cantilever(1.0, law, load=LOAD, gap=0.0).press()
     pair.slide_by(7.0)
-    assert moment(pair) == pytest.approx(-LOAD * WIDTH * (8.0 + WIDTH / 2), rel=1e-4)
+    assert reaction_moment(pair) == pytest.approx(-LOAD * WIDTH * (8.0 + WIDTH / 2), rel=1e-4)
 
 
 @pytest.mark.parametrize("steps", [1, 10])
@@ -474,13 +480,13 @@ def test_friction_without_pressure(steps):
     The difference is due to the eccentricity of the force, half of the height of the bar.
     """
     E = 1e5 / (1 - 0.3**2)
-    pair = on_cantilever(1.0, fc.Tresca(1.0, 1.0), clearance=0.01).press()
+    pair = pair_on_cantilever(1.0, fc.Tresca(1.0, 1.0), clearance=0.01).press()
     pair.slide_by(7.0, steps)
     tip = [fc.output.at_node(pair.scene.bodies.u, (10.0, y))[0] for y in (0.0, HEIGHT)]
     assert np.mean(tip) == pytest.approx(WIDTH * (8.0 + WIDTH / 2) / (E * HEIGHT), rel=0.02)
 
 
-def in_valley(kinematics, pushes):
+def push_out_of_valley(kinematics, pushes):
     """Return displacements, (n_pushes,), of a block on a weak spring pushed out of a valley."""
     length, amplitude, width, sag = 4.0, 0.15, 0.6, 0.03
 
@@ -489,8 +495,8 @@ def in_valley(kinematics, pushes):
         return np.column_stack([x[:, 0], x[:, 1] * height])
 
     def round_bottom(x):
-        share = (x[:, 0] - width / 2) / (width / 2)
-        return np.column_stack([x[:, 0], x[:, 1] + sag * share**2 * (0.5 - x[:, 1]) / 0.5])
+        offset = (x[:, 0] - width / 2) / (width / 2)
+        return np.column_stack([x[:, 0], x[:, 1] + sag * offset**2 * (0.5 - x[:, 1]) / 0.5])
 
     boxes = {
         "low": Box((0.0, 0.0), (length, 1.0), (64, 6), bend=valley),
@@ -525,10 +531,10 @@ def test_pair_iteration_is_relaxed_on_a_curved_surface():
     undeformed. Without relaxation, an increment with 0.026 against the push was verified.
     """
     pushes = [0.005, 0.01, 0.015, 0.02]
-    expected = in_valley("finite", pushes)
+    expected = push_out_of_valley("finite", pushes)
     assert expected[-1] > 0.03
-    found = in_valley("small", pushes)
-    assert np.abs(found - expected).max() < 0.03 * expected[-1]
+    computed = push_out_of_valley("small", pushes)
+    assert np.abs(computed - expected).max() < 0.03 * expected[-1]
 
 
 def test_failed_increment_keeps_the_trial_state():
@@ -562,7 +568,7 @@ def test_contact_slides_beyond_the_retained_dofs():
     """
     forces = []
     for condensation in (True, False):
-        made = SlidingBlock(
+        setup = SlidingBlock(
             "hexahedron",
             fc.Coulomb(0.3),
             start=0.6,
@@ -570,8 +576,8 @@ def test_contact_slides_beyond_the_retained_dofs():
             n=(14, 4),
             condensation=condensation,
         )
-        made.step(0.005, 0.0)
-        step = made.step(0.005, 1.5)
+        setup.step(0.005, 0.0)
+        step = setup.step(0.005, 1.5)
         forces.append(step.contacts["contact"].force)
     assert is_close(*forces, 1e-4)
 
@@ -584,7 +590,7 @@ def test_slides_over_many_facets_are_not_tunnelling(slide, enforcement):
     Their straight paths enter it through its bottom and leave it where Γc has no facets: an earlier
     version refused 28 of 64 slides.
     """
-    pair = on_slab(0.25, fc.Coulomb(0.3), enforcement=enforcement).press()
+    pair = pair_on_slab(0.25, fc.Coulomb(0.3), enforcement=enforcement).press()
     pair.along.value = slide
     slid = pair.problem.solve().contacts["contact"]
     assert slid.stick == 0 and slid.slip > 0

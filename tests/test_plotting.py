@@ -27,39 +27,39 @@ CORNERS = {"triangle": 3, "quadrilateral": 4, "tetrahedron": 3, "hexahedron": 4}
 
 
 @pytest.fixture
-def drawn(monkeypatch):
+def saved_figures(monkeypatch):
     """Return the list of saved figures, which remain open."""
     figures, save = [], drawing.save
 
-    def keep(figure, path):
+    def record_figure(figure, path):
         figures.append(figure)
         save(figure, path)
 
-    monkeypatch.setattr(drawing, "save", keep)
+    monkeypatch.setattr(drawing, "save", record_figure)
     return figures
 
 
 @pytest.mark.parametrize("cell", CELLS)
-def test_pictures_of_pressure_status_and_deformation(cell, tmp_path, drawn):
+def test_pictures_of_pressure_status_and_deformation(cell, tmp_path, saved_figures):
     """Every facet is drawn once on any number of ranks, at its place and in its colour.
 
     Axes have units, and displacements are magnified.
     """
     folder, d = shared_folder(tmp_path), dimension(cell)
-    made = BlockOnBall(cell=cell, mesh={"n": 4})
-    made.problem.small_displacement_tolerance = np.inf
-    (step,) = fc.increments(made.problem, made.load, 0, 2, steps=1)
-    plotting.plot_pressure(folder / "p.png", made.contact, length="m", stress="Pa", title="Title")
-    plotting.plot_status(folder / "s.png", made.contact, length="m")
-    plotting.plot_deformation(folder / "d.png", made.scene.u, unit="m", magnification=2.0)
-    points = made.contact.gather()
+    setup = BlockOnBall(cell=cell, mesh={"n": 4})
+    setup.problem.small_displacement_tolerance = np.inf
+    (step,) = fc.increments(setup.problem, setup.load, 0, 2, steps=1)
+    plotting.plot_pressure(folder / "p.png", setup.contact, length="m", stress="Pa", title="Title")
+    plotting.plot_status(folder / "s.png", setup.contact, length="m")
+    plotting.plot_deformation(folder / "d.png", setup.scene.u, unit="m", magnification=2.0)
+    points = setup.contact.gather()
     n_facets = {2: 4, 3: 16}[d] * (2 if cell == "tetrahedron" else 1)
     n_shapes = {"triangle": 32, "quadrilateral": 16, "tetrahedron": 192, "hexahedron": 96}[cell]
 
     def check():
-        assert len(drawn) == 3
-        pressure, status, deformed = drawn
-        for figure in drawn:
+        assert len(saved_figures) == 3
+        pressure, status, deformed = saved_figures
+        for figure in saved_figures:
             axes = figure.axes[0]
             assert axes.get_xlabel() == "x [m]" and axes.get_ylabel() == "y [m]"
         assert pressure.axes[1].get_ylabel() == "contact pressure [Pa]"
@@ -71,8 +71,8 @@ def test_pictures_of_pressure_status_and_deformation(cell, tmp_path, drawn):
         assert is_close(pressure.axes[1].get_ylim(), [0.0, by_facet.max()], 1e-12)
         colours = surface.get_facecolor() if d == 3 else surface.get_color()
         grey = matplotlib.colors.to_rgba("#d8d8d8")
-        bears = ~np.all(np.isclose(np.asarray(colours), grey), axis=1)
-        assert np.count_nonzero(bears) == np.count_nonzero(by_facet > 0)
+        is_loaded = ~np.all(np.isclose(np.asarray(colours), grey), axis=1)
+        assert np.count_nonzero(is_loaded) == np.count_nonzero(by_facet > 0)
         names = [text.get_text() for text in status.legends[0].get_texts()]
         assert names == ["open", "sticking", "slipping", *["rigid obstacle"] * (d == 2)]
         # Displacements are magnified by 2: the top moves by 0.1 along x and 0.03 down.
@@ -93,30 +93,30 @@ def test_pictures_of_pressure_status_and_deformation(cell, tmp_path, drawn):
 
 
 @pytest.mark.parametrize("cell", CELLS)
-def test_pictures_of_fields_and_stress(cell, tmp_path, drawn):
+def test_pictures_of_fields_and_stress(cell, tmp_path, saved_figures):
     """Facet means and point values agree with `gather`, von Mises stresses with a closed form.
 
     The stress is E ε along x, where the strain ε is proportional to x.
     """
     folder, d = shared_folder(tmp_path), dimension(cell)
-    made = BlockOnBall(cell=cell, mesh={"n": 4})
-    made.problem.small_displacement_tolerance = np.inf
-    list(fc.increments(made.problem, made.load, 0, 2, steps=2))
+    setup = BlockOnBall(cell=cell, mesh={"n": 4})
+    setup.problem.small_displacement_tolerance = np.inf
+    list(fc.increments(setup.problem, setup.load, 0, 2, steps=2))
     fields = ("pressure", "friction", "gap", "slip")
     for field in fields:
-        plotting.plot_field(folder / f"{field}.png", made.contact, field)
+        plotting.plot_field(folder / f"{field}.png", setup.contact, field)
     if d == 2:
-        plotting.plot_along(folder / "along.png", made.contact)
+        plotting.plot_along(folder / "along.png", setup.contact)
     else:
         assert_raised_on_all_ranks(
-            lambda: plotting.plot_along(folder / "a.png", made.contact), ValueError, "plot_field"
+            lambda: plotting.plot_along(folder / "a.png", setup.contact), ValueError, "plot_field"
         )
     assert_raised_on_all_ranks(
-        lambda: plotting.plot_field(folder / "a.png", made.contact, "heat"), ValueError, "'heat'"
+        lambda: plotting.plot_field(folder / "a.png", setup.contact, "heat"), ValueError, "'heat'"
     )
-    points = made.contact.gather()
+    points = setup.contact.gather()
     points["friction"] = np.linalg.norm(points["tangential_traction"], axis=1)
-    u = fem.Function(fem.functionspace(made.scene.mesh, ("Lagrange", 2, (d,))))
+    u = fem.Function(fem.functionspace(setup.scene.mesh, ("Lagrange", 2, (d,))))
     u.interpolate(lambda x: np.vstack([0.05 * x[0] ** 2, *(0 * x[1:d])]))
     zero = 0.0 * u[0]
     rows = [[1000 * u[0].dx(0), zero, zero], [zero, zero, zero], [zero, zero, zero]]
@@ -127,14 +127,14 @@ def test_pictures_of_fields_and_stress(cell, tmp_path, drawn):
     )
 
     def check():
-        for field, figure in zip(fields, drawn, strict=False):
+        for field, figure in zip(fields, saved_figures, strict=False):
             means = per_facet(points | {"pressure": points[field]}, cell)
             ends = [min(0.0, means.min()), max(0.0, means.max())]
             assert is_close(figure.axes[1].get_ylim(), ends, 1e-12), field
             grey = field != "gap" and bool(np.any(means == 0.0))
-            assert entries(figure)[d == 2 :] == ([f"no {field}"] if grey else [])
+            assert legend_texts(figure)[d == 2 :] == ([f"no {field}"] if grey else [])
         if d == 2:
-            lines = [line for axes in drawn[4].axes for line in axes.lines]
+            lines = [line for axes in saved_figures[4].axes for line in axes.lines]
             curves = {line.get_label(): line.get_data() for line in lines}
             names = {"pressure": "pressure", "|tangential traction|": "friction", "gap": "gap"}
             for label, name in (names | {"accumulated slip": "slip"}).items():
@@ -143,15 +143,15 @@ def test_pictures_of_fields_and_stress(cell, tmp_path, drawn):
                 near = (points["x"][:, 0] >= x.min()) & (points["x"][:, 0] <= x.max())
                 assert np.array_equal(np.sort(y), np.sort(points[name][near]))
         # The colour scale ends at the stress in the midpoints of the last cells along x.
-        body = drawn[-1].axes[0].collections[1]
+        body = saved_figures[-1].axes[0].collections[1]
         largest = {"triangle": 11 / 12, "tetrahedron": 15 / 16}.get(cell, 7 / 8)
-        assert is_close(drawn[-1].axes[1].get_ylim(), [0, 100 * largest], 1e-9)
+        assert is_close(saved_figures[-1].axes[1].get_ylim(), [0, 100 * largest], 1e-9)
         assert len(np.unique(np.asarray(body.get_facecolor()), axis=0)) >= 4
 
     check_on_first_rank(check)
 
 
-def entries(figure):
+def legend_texts(figure):
     """Return the texts in the legends of a figure."""
     return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
 
@@ -180,11 +180,11 @@ def per_facet(points, cell):
 
 def test_missing_folder_is_refused(tmp_path):
     """All ranks raise the error of the first rank, without a picture."""
-    made = BlockOnBall()
+    setup = BlockOnBall()
     path = shared_folder(tmp_path) / "no" / "p.png"
     for call in (
-        lambda: plotting.plot_pressure(path, made.contact),
-        lambda: plotting.plot_deformation(path, made.scene.u),
+        lambda: plotting.plot_pressure(path, setup.contact),
+        lambda: plotting.plot_deformation(path, setup.scene.u),
     ):
         assert_raised_on_all_ranks(call, OSError, "no")
 
@@ -203,30 +203,32 @@ def test_wrong_displacements_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("cell", CELLS)
-def test_near_restricts_pictures_to_the_contact(cell, tmp_path, drawn):
+def test_near_restricts_pictures_to_the_contact(cell, tmp_path, saved_figures):
     """All loaded facets are drawn, and nothing beyond ``near`` of them, unless it is None."""
     folder, d = shared_folder(tmp_path), dimension(cell)
-    made = BlockOnBall(cell=cell, mesh={"n": 8 if d == 2 else 4})
-    made.problem.small_displacement_tolerance = np.inf
-    list(fc.increments(made.problem, made.load, 0, 1, steps=1))
-    points = made.contact.gather()
+    setup = BlockOnBall(cell=cell, mesh={"n": 8 if d == 2 else 4})
+    setup.problem.small_displacement_tolerance = np.inf
+    list(fc.increments(setup.problem, setup.load, 0, 1, steps=1))
+    points = setup.contact.gather()
     reach, count = 0.05, np.count_nonzero(per_facet(points, cell) > 0)
     for near in (reach, None):
-        plotting.plot_pressure(folder / "p.png", made.contact, near=near)
-        plotting.plot_status(folder / "s.png", made.contact, near=near)
+        plotting.plot_pressure(folder / "p.png", setup.contact, near=near)
+        plotting.plot_status(folder / "s.png", setup.contact, near=near)
     for near in (0.0, -1.0, np.nan, "near"):
         assert_raised_on_all_ranks(
-            lambda near=near: plotting.plot_status(folder / "a.png", made.contact, near=near),
+            lambda near=near: plotting.plot_status(folder / "a.png", setup.contact, near=near),
             ValueError,
             "length greater than zero",
         )
 
     def check():
-        close_up, _, whole, _ = drawn
-        (some, every) = (shapes(figure.axes[0].collections[-1]) for figure in (close_up, whole))
-        assert count <= len(some) < len(every)
-        assert entries(whole)[d == 2 :] == ["no pressure"]
-        for figure in drawn[:2]:
+        close_up, _, full_view, _ = saved_figures
+        (some, all_shapes) = (
+            shapes(figure.axes[0].collections[-1]) for figure in (close_up, full_view)
+        )
+        assert count <= len(some) < len(all_shapes)
+        assert legend_texts(full_view)[d == 2 :] == ["no pressure"]
+        for figure in saved_figures[:2]:
             body, *_, surface = figure.axes[0].collections
             bearing = np.concatenate(shapes(surface))
             n = CORNERS[cell]  # a closed path repeats the first

@@ -32,8 +32,8 @@ def increment_angle(contact, axis):
     motion /= max(1, COMM.allreduce(int(len(contact.points) > 0)))
     for i, constant in contact.free_motion.items():
         motion[i] += float(constant.value)
-    found = contact.moment(np.asarray(axis) + motion)
-    return float(found @ contact.obstacle.rotation.unit_axis(d)[-len(found) :])
+    moment = contact.moment(np.asarray(axis) + motion)
+    return float(moment @ contact.obstacle.rotation.unit_axis(d)[-len(moment) :])
 
 
 def moment_of(tool):
@@ -41,7 +41,7 @@ def moment_of(tool):
     return increment_angle(tool.contact, tool.vector(0.0, tool.scene.height + RADIUS))
 
 
-def roll(tool, side, up, moment):
+def solve_with_moment(tool, side, up, moment):
     """Set the moment of a driven `DiscOnRubber` and solve an increment."""
     tool.moment.value = moment
     return tool.solve_increment(side, up)
@@ -68,7 +68,7 @@ def scene_of(cell, law, shape):
     return problem, contact
 
 
-def difference(problem, contact, state, direction):
+def tangent_errors(problem, contact, state, direction):
     """Compare the tangent times a direction with central differences of the forces.
 
     Returns:
@@ -77,8 +77,8 @@ def difference(problem, contact, state, direction):
     """
     operator, unknowns, step = problem.full.operators[0], problem.full.unknowns, 1e-6
 
-    def force(share):
-        problem.full.set_state(state + share * step * direction)
+    def force(factor):
+        problem.full.set_state(state + factor * step * direction)
         vector = unknowns.vector()
         operator.add_force(vector)
         return vector.array_r.copy()
@@ -104,7 +104,7 @@ def test_tangent_matches_central_differences(cell, shape):
     Central differences of 1e-6 in a state of size 1 have an error of 1e-9. Open, sticking and
     slipping points occur. The matrix without friction is symmetric, to round-off.
     """
-    seen = np.zeros(3)
+    n_by_status = np.zeros(3)
     for law in (fc.Frictionless(K), fc.Coulomb(0.3, K, K), fc.Coulomb(5.0, K, K)):
         problem, contact = scene_of(cell, law, shape)
         d, unknowns, u = contact.points.shape[1], problem.full.unknowns, problem.u
@@ -117,22 +117,22 @@ def test_tangent_matches_central_differences(cell, shape):
             problem.full.set_state(state)
             contact.evaluate()
             r = contact.resultants()
-            seen += [r.open, r.stick, r.slip]
+            n_by_status += [r.open, r.stick, r.slip]
             u.interpolate(rough_field(d, seed + 5))
             direction = u.x.array[: unknowns.n_dofs].copy()
-            still = np.zeros_like(direction)
+            no_motion = np.zeros_like(direction)
             angle, shifts = np.eye(n_motions)[-1], 1.0 - np.eye(n_motions)[-1]
-            directions = [unknowns.joined(still, angle), unknowns.joined(still, shifts)]
+            directions = [unknowns.joined(no_motion, angle), unknowns.joined(no_motion, shifts)]
             directions += [unknowns.joined(direction, 0 * angle), unknowns.joined(direction, angle)]
             for perturbation in directions:
-                assert max(difference(problem, contact, state, perturbation)) < 1e-6
+                assert max(tangent_errors(problem, contact, state, perturbation)) < 1e-6
             if contact.effective_law.has_potential:
                 tangent = problem.full.operators[0].tangent()
                 mirrored = tangent.copy().transpose()
                 mirrored.axpy(-1.0, tangent)
                 assert 0 < tangent.norm() and mirrored.norm() < 1e-13 * tangent.norm()
             contact.commit()
-    assert seen[0] > 0 and seen[1] > 0 and seen[2] > 0
+    assert n_by_status[0] > 0 and n_by_status[1] > 0 and n_by_status[2] > 0
 
 
 # ---- balance -------------------------------------------------------------------------------------
@@ -216,9 +216,9 @@ def test_driven_roller_exerts_traction():
     The force cannot exceed μ N: then there is no solution, and the state is as before.
     """
     tool = DiscOnRubber(by_moment=True, n=(16, 6))
-    roll(tool, 0.0, -0.1, 0.0)
+    solve_with_moment(tool, 0.0, -0.1, 0.0)
     for moment in (2.0, 8.0, -8.0):
-        roll(tool, 0.0, -0.1, moment)
+        solve_with_moment(tool, 0.0, -0.1, moment)
         assert moment_of(tool) == pytest.approx(moment, rel=1e-9)
         assert tool.resultant()[0] == pytest.approx(moment / RADIUS, rel=0.05)
     before, angle = tool.problem.full.state(), float(tool.contact.free_angle.value)
@@ -240,17 +240,17 @@ def test_prescribed_moment_and_prescribed_angle_agree(cell, enforcement):
     contact = {"enforcement": enforcement, "tolerance": 1e-9}
     options = {"contact": contact, "law": fc.Coulomb(0.2, 1e4, 1e4)}
     one, other = (DiscOnRubber(cell, by_moment=driven, **options) for driven in (True, False))
-    seen = np.zeros(2)
+    n_by_status = np.zeros(2)
     for side, up, moment in PATH:
-        step = roll(one, side, up, moment)
-        seen += [one.contact.resultants().stick, one.contact.resultants().slip]
-        given = other.solve_increment(side, up, float(one.contact.free_angle.value))
+        step = solve_with_moment(one, side, up, moment)
+        n_by_status += [one.contact.resultants().stick, one.contact.resultants().slip]
+        angle_step = other.solve_increment(side, up, float(one.contact.free_angle.value))
         assert is_close(other.tractions(), one.tractions(), 1e-7)
         size = abs(step.energy.elastic) + abs(step.energy.work)
-        assert abs(step.energy.work - given.energy.work) < 1e-6 * size
+        assert abs(step.energy.work - angle_step.energy.work) < 1e-6 * size
         assert abs(step.energy.imbalance) < 1e-9 * size
-    assert seen[0] > 0
-    assert seen[1] > 0 or cell == "tetrahedron"  # few points, which all stick
+    assert n_by_status[0] > 0
+    assert n_by_status[1] > 0 or cell == "tetrahedron"  # few points, which all stick
 
 
 def test_rotation_of_the_whole_scene_rotates_the_solution():
@@ -259,10 +259,10 @@ def test_rotation_of_the_whole_scene_rotates_the_solution():
     Tractions are those of the scene that is not rotated, rotated, and the computed angle is larger
     by the angle of the rotation: 1e-9.
     """
-    still, tool = (DiscOnRubber(by_moment=True) for _ in range(2))
+    unrotated, tool = (DiscOnRubber(by_moment=True) for _ in range(2))
     for side, up, moment in PATH[:3]:
-        roll(still, side, up, moment)
-        roll(tool, side, up, moment)
+        solve_with_moment(unrotated, side, up, moment)
+        solve_with_moment(tool, side, up, moment)
     centre = tool.vector(0.0, tool.scene.height + RADIUS)
     half = tuple((a + b) / 2 for a, b in zip(PATH[2], PATH[3], strict=True))
     directions = [*((a, PATH[2]) for a in (0.3, 0.6, 0.9, 1.2)), (1.2, half), (1.2, PATH[3])]
@@ -275,19 +275,19 @@ def test_rotation_of_the_whole_scene_rotates_the_solution():
         tool.problem.solve()
         tool.problem.commit()
         if (side, up, moment) != PATH[2]:
-            roll(still, side, up, moment)
-        assert is_close(tool.tractions(), still.tractions() @ matrix.T, 1e-9)
-        found = float(tool.contact.free_angle.value) - float(still.contact.free_angle.value)
-        assert found == pytest.approx(angle, abs=1e-9)
+            solve_with_moment(unrotated, side, up, moment)
+        assert is_close(tool.tractions(), unrotated.tractions() @ matrix.T, 1e-9)
+        computed = float(tool.contact.free_angle.value) - float(unrotated.contact.free_angle.value)
+        assert computed == pytest.approx(angle, abs=1e-9)
 
 
 def test_work_of_the_moment():
     """A drum is driven in small increments: the work in the energies is the moment's, to 2 %."""
     tool = DiscOnRubber(by_moment=True, n=(12, 6))
-    roll(tool, 0.0, -0.1, 0.0)
+    solve_with_moment(tool, 0.0, -0.1, 0.0)
     work, moment, angle = 0.0, 0.0, float(tool.contact.free_angle.value)
     for value in (2.0, 4.0, 6.0, 8.0, 6.0, 2.0):
-        step = roll(tool, 0.0, -0.1, value)
+        step = solve_with_moment(tool, 0.0, -0.1, value)
         turned = float(tool.contact.free_angle.value) - angle
         work, moment, angle = (moment + value) / 2 * turned, value, angle + turned
         assert step.energy.work == pytest.approx(work, rel=0.02)
@@ -298,7 +298,7 @@ def test_moment_is_reached_by_lbfgs_and_mixed_elements(options):
     """With L-BFGS, and with the pressure as an unknown, the moment is as prescribed, to 1e-9."""
     tool = DiscOnRubber(by_moment=True, n=(8, 4), **options)
     for side, up, moment in PATH:
-        roll(tool, side, up, moment)
+        solve_with_moment(tool, side, up, moment)
         assert moment_of(tool) == pytest.approx(moment, rel=1e-9, abs=1e-8)
 
 
@@ -310,29 +310,29 @@ def test_two_rollers_have_their_own_moments():
     """
     scene = block("quadrilateral", 1, n=6)
     force, *moments = (fem.Constant(scene.mesh, 0.0) for _ in range(3))
-    law, made = fc.Coulomb(0.4, 2e4, 1e4), []
+    law, rollers = fc.Coulomb(0.4, 2e4, 1e4), []
     up = fc.Motion(force=(None, force), displacement=(0.0, None))
     for tag, y, move, moment in ((BOTTOM, -0.6, up, 0), (TOP, 1.6, (0.0, -0.01), 1)):
         turn = fc.Rotation(None, (0.5, y), moment=moments[moment])
         roller = fc.Cylinder((0.5, y), 0.6, displacement=move, rotation=turn)
         surface = fc.ContactSurface(scene.mesh, scene.tags, tag)
         name = f"roller {tag}"
-        made.append(fc.Contact(scene.u, surface, roller, law, kinematics="finite", name=name))
+        rollers.append(fc.Contact(scene.u, surface, roller, law, kinematics="finite", name=name))
     problem = fc.ContactProblem(
         scene.F,
         scene.u,
         bcs=[scene.dirichlet_bc(LEFT, 0)],
-        contacts=made,
+        contacts=rollers,
         petsc_options=TIGHT_TOLERANCE,
     )
     for force.value, turning in ((10.0, 0.0), (20.0, 0.0), (20.0, 1.0), (20.0, -1.0)):
         moments[0].value, moments[1].value = turning, -turning
         problem.solve()
         problem.commit()
-        assert made[0].resultants().force[1] == pytest.approx(force.value, rel=1e-9)
-        for contact, y, sign in zip(made, (-0.6, 1.6), (1, -1), strict=True):
+        assert rollers[0].resultants().force[1] == pytest.approx(force.value, rel=1e-9)
+        for contact, y, sign in zip(rollers, (-0.6, 1.6), (1, -1), strict=True):
             assert abs(increment_angle(contact, (0.5, y)) - sign * turning) < 1e-9 * 20 * 0.6
-        angles = [float(contact.free_angle.value) for contact in made]
+        angles = [float(contact.free_angle.value) for contact in rollers]
         assert angles[0] == pytest.approx(-angles[1], rel=1e-9)
     assert abs(angles[0]) > 1e-3
 
@@ -342,7 +342,7 @@ def test_two_rollers_have_their_own_moments():
 
 def test_condensed_and_full_systems_agree():
     """Static condensation of a linear body onto contact dofs and angle changes nothing, to 1e-8."""
-    found = []
+    computed = []
     for condensation in (True, False):
         solver = {"small_displacement_tolerance": np.inf, "condensation": condensation}
         solver |= {} if condensation else {"method": "newton"}
@@ -350,9 +350,9 @@ def test_condensed_and_full_systems_agree():
         for step in tool.increments(3.0):
             assert step.contacts["contact"].force[-1] == pytest.approx(tool.down.value, rel=1e-8)
         assert tool.problem.solver.condensed == condensation
-        found.append((tool.tractions(), float(tool.contact.free_angle.value)))
-    assert is_close(found[0][0], found[1][0], 1e-8)
-    assert found[0][1] == pytest.approx(found[1][1], rel=1e-8)
+        computed.append((tool.tractions(), float(tool.contact.free_angle.value)))
+    assert is_close(computed[0][0], computed[1][0], 1e-8)
+    assert computed[0][1] == pytest.approx(computed[1][1], rel=1e-8)
 
 
 VARIANTS = {
@@ -385,19 +385,21 @@ def test_checkpoint_of_another_axis_or_moment_is_refused(tmp_path):
         obstacle = fc.Ball((0, 1.8), 0.8, displacement=(0, -0.05), rotation=turn)
         return scene.problem(obstacle, fc.Coulomb(0.3, 1e4, 1e4))[0]
 
-    for given, other in (({"angle": 0.0}, {"moment": 0.0}), ({"moment": 0.0}, {"angle": 0.0})):
-        problem = make(**given)
+    for options, other in (({"angle": 0.0}, {"moment": 0.0}), ({"moment": 0.0}, {"angle": 0.0})):
+        problem = make(**options)
         problem.solve()
         problem.commit()
         checkpoint.save(problem, path)
-        checkpoint.load(make(**given), path)
-        changed = dict.fromkeys(given, 0.1)
-        for again, word in (
-            (make(**given, about=(0.1, 1.8)), "about"),
-            (make(**changed), "turn of" if "angle" in given else "free obstacles"),
+        checkpoint.load(make(**options), path)
+        changed = dict.fromkeys(options, 0.1)
+        for mismatched, word in (
+            (make(**options, about=(0.1, 1.8)), "about"),
+            (make(**changed), "turn of" if "angle" in options else "free obstacles"),
             (make(**other), "free motion"),
         ):
-            assert_raised_on_all_ranks(lambda p=again: checkpoint.load(p, path), ValueError, word)
+            assert_raised_on_all_ranks(
+                lambda p=mismatched: checkpoint.load(p, path), ValueError, word
+            )
 
 
 def test_checkpoint_of_another_axis_direction_is_refused(tmp_path):
@@ -421,7 +423,7 @@ def test_increments_are_cut_up_to_the_friction_limit():
     increment that is not cut too often. The last state has its moment, to 1e-9.
     """
     tool = DiscOnRubber(by_moment=True, n=(8, 3), degree=1)
-    roll(tool, 0.0, -0.1, 0.0)
+    solve_with_moment(tool, 0.0, -0.1, 0.0)
     reached = []
 
     def drive():
@@ -440,7 +442,7 @@ def test_increments_are_cut_up_to_the_friction_limit():
 def test_rotation_by_more_than_a_right_angle_is_no_trial_state():
     """The residual of such a state is NaN, so that a line search takes a shorter step."""
     tool = DiscOnRubber(by_moment=True, n=(4, 2))
-    roll(tool, 0.0, -0.05, 0.0)
+    solve_with_moment(tool, 0.0, -0.05, 0.0)
     system, unknowns = tool.problem.full, tool.problem.full.unknowns
     start = system.state()
     for angle, twisted in ((1.5, False), (-1.5, False), (1.6, True), (-7.0, True)):

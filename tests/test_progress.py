@@ -42,9 +42,9 @@ class Terminal(io.StringIO):
 
 def terminal_of(monkeypatch: pytest.MonkeyPatch) -> Terminal:
     """Replace `sys.stderr` of this rank, and return the replacement."""
-    made = Terminal()
-    monkeypatch.setattr(sys, "stderr", made)
-    return made
+    stream = Terminal()
+    monkeypatch.setattr(sys, "stderr", stream)
+    return stream
 
 
 def history(ends: list[float], scene=None, **options) -> fc.Step:

@@ -47,13 +47,15 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         """Store pictures, addresses and the beginning of a table cell."""
-        found = dict(attrs)
+        attributes = dict(attrs)
         for name in ("src", "href"):
-            address = found.get(name)
+            address = attributes.get(name)
             if address is not None and not address.startswith("data:image/png;base64,"):
                 self.outside.append(address)
             elif address is not None:
-                self.pictures[found["alt"]] = base64.b64decode(address.split(",")[1], validate=True)
+                self.pictures[attributes["alt"]] = base64.b64decode(
+                    address.split(",")[1], validate=True
+                )
         if tag == "tr":
             self._rows.append([])
         if tag in ("th", "td"):
@@ -97,12 +99,14 @@ class Page(HTMLParser):
             assert chosen["obstacle"] == type(contact.obstacle).__name__
             assert chosen["kinematics"] == ("finite" if contact.finite else "small")
             for name, constant in contact.parameters.items():
-                told = ", ".join(f"{x:g}" for x in np.ravel(constant.value))
+                value = ", ".join(f"{x:g}" for x in np.ravel(constant.value))
                 scaled = isinstance(getattr(contact.law, name, None), fc.RelativeStiffness)
-                assert chosen[name] == told + (" E/h" if scaled else "")
+                assert chosen[name] == value + (" E/h" if scaled else "")
         extents = self.tables["Extents on the undeformed surface"]  # of the first contact only
-        found = steps[-1].contacts[problem.contacts[0].name].extents
-        for (name, area, *_), (state, extent) in zip(extents[1:], found.items(), strict=True):
+        extent_by_state = steps[-1].contacts[problem.contacts[0].name].extents
+        for (name, area, *_), (state, extent) in zip(
+            extents[1:], extent_by_state.items(), strict=True
+        ):
             assert name == state and area == f"{extent.area:.6g}"
         residual = f"{steps[-1].verdict.relative_residual:.1e}"
         assert f"The residual is {residual} of the forces" in self.text
@@ -111,20 +115,20 @@ class Page(HTMLParser):
 @pytest.fixture
 def curves(monkeypatch):
     """Record the curves drawn on the first rank: x and y by the labels of y axis and curve."""
-    found, save = {}, drawing.save
+    drawn_curves, save = {}, drawing.save
 
-    def keep(figure, path):
+    def record_figure(figure, path):
         for axes in figure.axes:
             for line in axes.get_lines():
                 key = axes.get_ylabel(), line.get_label()
-                found.setdefault(key, []).append(np.array(line.get_data()))
+                drawn_curves.setdefault(key, []).append(np.array(line.get_data()))
         save(figure, path)
 
-    monkeypatch.setattr(drawing, "save", keep)
-    return found
+    monkeypatch.setattr(drawing, "save", record_figure)
+    return drawn_curves
 
 
-def drawn(curves, key, n=0):
+def drawn_curve(curves, key, n=0):
     """Return the n-th curve of a key, broadcast from the first rank to all ranks."""
     return COMM.bcast(curves[key][n] if COMM.rank == 0 else None)
 
@@ -135,26 +139,26 @@ def test_report_of_a_restarted_history(tmp_path, curves):
     References: the steps of both runs.
     """
     folder = shared_folder(tmp_path)
-    kept = {"checkpoint": folder / "state.npz", "csv": folder / "history.csv"}
+    files = {"checkpoint": folder / "state.npz", "csv": folder / "history.csv"}
 
     def press():
         return BlockOnBallHistory(wall=True, contact={"enforcement": "augmented"})
 
     steps = []
-    for step in press().increments(3.0, **kept):
+    for step in press().increments(3.0, **files):
         steps.append(step)
         if step.increment == 3:
             break
-    made = press()
-    steps += list(made.increments(3.0, **kept))
-    scene = made.scene
+    setup = press()
+    steps += list(setup.increments(3.0, **files))
+    scene = setup.scene
     body = fc.elasticity.LinearElastic(scene.u, scene.E, scene.nu, "plane strain")
-    budget = fc.estimate_errors(made.problem, stress(scene.u, scene.E, scene.nu))
+    budget = fc.estimate_errors(setup.problem, stress(scene.u, scene.E, scene.nu))
     path = fc.report(
-        made.problem,
+        setup.problem,
         steps[-1],
         folder / "new" / "folder",
-        csv=kept["csv"],
+        csv=files["csv"],
         stress=body.stress,
         budget=budget,
         title="<b>one & two</b>",
@@ -162,7 +166,7 @@ def test_report_of_a_restarted_history(tmp_path, curves):
     )
     assert path == folder / "new" / "folder" / "report.html"
     page = Page(path)
-    page.check(made.problem, steps)
+    page.check(setup.problem, steps)
     assert "<b>one & two</b>" in page.text and "Increments 1 to 6" in page.text
     assert "per m of thickness" in page.text
     assert page.tables["Error budget"][0][1:] == list(budget.values)
@@ -171,52 +175,56 @@ def test_report_of_a_restarted_history(tmp_path, curves):
     loads = [step.load for step in steps]
     for n, name in enumerate(("floor", "wall")):
         for i, axis in enumerate("xy"):
-            x, y = drawn(curves, ("force on the body [kN/m]", f"force {axis}"), n)
+            x, y = drawn_curve(curves, ("force on the body [kN/m]", f"force {axis}"), n)
             assert is_close(x, loads, 1e-14)
             assert is_close(y, [step.contacts[name].force[i] for step in steps], 1e-14)
-        x, y = drawn(curves, ("moment about the origin [kN m/m]", "moment z"), n)
+        x, y = drawn_curve(curves, ("moment about the origin [kN m/m]", "moment z"), n)
         assert is_close(y, [step.contacts[name].moment[0] for step in steps], 1e-14)
-        x, y = drawn(curves, ("area [m²/m]", "stick"), n)
+        x, y = drawn_curve(curves, ("area [m²/m]", "stick"), n)
         assert is_close(y, [step.contacts[name].extents["stick"].area for step in steps], 1e-14)
-    x, y = drawn(curves, ("energy [kN m/m]", "dissipation by friction"))
+    x, y = drawn_curve(curves, ("energy [kN m/m]", "dissipation by friction"))
     assert is_close(y, np.cumsum([step.energy.dissipation for step in steps]), 1e-14)
     # At the points near the contact: the values of `gather`.
-    points = made.problem.contacts[0].gather()
-    x, y = drawn(curves, ("traction [kPa]", "pressure"))
+    points = setup.problem.contacts[0].gather()
+    x, y = drawn_curve(curves, ("traction [kPa]", "pressure"))
     assert is_close([y.max()], [points["pressure"].max()], 1e-14)
     assert set(x) <= set(points["x"][:, 0])
 
 
-def space():
+def block_in_space():
     """Return the problem, steps and stress of a block in space."""
-    made = BlockOnBall(cell="tetrahedron")
-    made.problem.small_displacement_tolerance = np.inf
-    steps = list(fc.increments(made.problem, made.load, 0, 2, steps=2))
-    return made.problem, steps, stress(made.scene.u, made.scene.E, made.scene.nu)
+    setup = BlockOnBall(cell="tetrahedron")
+    setup.problem.small_displacement_tolerance = np.inf
+    steps = list(fc.increments(setup.problem, setup.load, 0, 2, steps=2))
+    return setup.problem, steps, stress(setup.scene.u, setup.scene.E, setup.scene.nu)
 
 
-def bodies():
+def two_bodies_with_pair_updates():
     """Return the problem and steps of two bodies whose pairs are updated."""
-    made = BlockOnRamp()
-    return made.problem, list(made.increments(1.0)), None
+    ramp = BlockOnRamp()
+    return ramp.problem, list(ramp.increments(1.0)), None
 
 
-def finite():
+def rubber_under_disc():
     """Return the problem and steps of rubber under a disc with large displacements."""
-    made = DiscOnRubber()
-    return made.problem, list(made.increments(1.0)), None
+    setup = DiscOnRubber()
+    return setup.problem, list(setup.increments(1.0)), None
 
 
-def alone():
+def single_step():
     """Return the problem and one step without a load parameter, not committed."""
-    made = BlockOnBall(fc.Coulomb(0.3))
-    made.problem.small_displacement_tolerance = np.inf
-    made.set_top_displacement(0.01, 0.03)
-    return made.problem, made.problem.solve(), None
+    setup = BlockOnBall(fc.Coulomb(0.3))
+    setup.problem.small_displacement_tolerance = np.inf
+    setup.set_top_displacement(0.01, 0.03)
+    return setup.problem, setup.problem.solve(), None
 
 
 @pytest.mark.each
-@pytest.mark.parametrize("scene", [space, bodies, finite, alone], ids=lambda f: f.__name__)
+@pytest.mark.parametrize(
+    "scene",
+    [block_in_space, two_bodies_with_pair_updates, rubber_under_disc, single_step],
+    ids=lambda f: f.__name__,
+)
 def test_report_of_every_kind_of_problem(scene, tmp_path, curves):
     """Reports in space, between bodies, with large displacements, and of a step not committed."""
     problem, steps, sigma = scene()
@@ -224,7 +232,7 @@ def test_report_of_every_kind_of_problem(scene, tmp_path, curves):
     steps = [steps] if isinstance(steps, fc.Step) else steps
     Page(path).check(problem, steps)
     per = "/mm" if problem.contacts[0].points.shape[1] == 2 else ""
-    force = drawn(curves, (f"force on the body [N{per}]", "force y"))
+    force = drawn_curve(curves, (f"force on the body [N{per}]", "force y"))
     name = problem.contacts[0].name
     assert is_close(force[1], [step.contacts[name].force[1] for step in steps], 1e-14)
     loads = [step.increment if step.load is None else step.load for step in steps]
@@ -266,10 +274,12 @@ def test_report_of_an_unloaded_body(tmp_path):
 def test_invalid_input_is_refused(tmp_path):
     """Invalid input is refused on all ranks, before any work; no report is written."""
     folder = shared_folder(tmp_path)
-    made = BlockOnBall()
-    made.problem.small_displacement_tolerance = np.inf
-    first, step = fc.increments(made.problem, made.load, 0, 1, steps=2, csv=folder / "history.csv")
-    problem, page = made.problem, folder / "page"
+    setup = BlockOnBall()
+    setup.problem.small_displacement_tolerance = np.inf
+    first, step = fc.increments(
+        setup.problem, setup.load, 0, 1, steps=2, csv=folder / "history.csv"
+    )
+    problem, page = setup.problem, folder / "page"
     if COMM.rank == 0:
         lines = (folder / "history.csv").read_text().splitlines(keepends=True)
         (folder / "short.csv").write_text("".join(lines[:2]))
@@ -278,7 +288,7 @@ def test_invalid_input_is_refused(tmp_path):
     COMM.barrier()
     several = (each for each in [step])
     for words, arguments, options in (
-        (("problem",), (made.contact, step, page), {}),
+        (("problem",), (setup.contact, step, page), {}),
         (
             ("steps is a generator", "list(increments"),
             (problem, several, page),
@@ -292,7 +302,7 @@ def test_invalid_input_is_refused(tmp_path):
         (("last increment is 1",), (problem, step, page), {"csv": folder / "short.csv"}),
         (("no column 'increment'",), (problem, step, page), {"csv": folder / "other.csv"}),
         (("or is empty",), (problem, step, page), {"csv": folder / "empty.csv"}),
-        (("shape ()", "(3, 3)"), (problem, step, page), {"stress": made.scene.E}),
+        (("shape ()", "(3, 3)"), (problem, step, page), {"stress": setup.scene.E}),
         (("budget is a float",), (problem, step, page), {"budget": 0.1}),
         (("title",), (problem, step, page), {"title": 1}),
         (("units is 'mm'",), (problem, step, page), {"units": "mm"}),
@@ -316,19 +326,19 @@ def test_invalid_input_is_refused(tmp_path):
 def test_failure_keeps_the_previous_report(tmp_path, monkeypatch):
     """If a picture cannot be drawn, all ranks raise the error, and the report is unchanged."""
     folder = shared_folder(tmp_path)
-    made = BlockOnBall()
-    made.problem.small_displacement_tolerance = np.inf
-    (step,) = fc.increments(made.problem, made.load, 0, 1)
-    path = fc.report(made.problem, step, folder)
+    setup = BlockOnBall()
+    setup.problem.small_displacement_tolerance = np.inf
+    (step,) = fc.increments(setup.problem, setup.load, 0, 1)
+    path = fc.report(setup.problem, step, folder)
     COMM.barrier()
     before = path.read_bytes()
 
-    def failing(figure, path):
+    def raise_error(figure, path):
         raise OSError("no more ink")
 
-    monkeypatch.setattr(drawing, "save", failing)
+    monkeypatch.setattr(drawing, "save", raise_error)
     assert_raised_on_all_ranks(
-        lambda: fc.report(made.problem, step, folder), OSError, "no more ink"
+        lambda: fc.report(setup.problem, step, folder), OSError, "no more ink"
     )
     COMM.barrier()
     assert path.read_bytes() == before and [p.name for p in folder.iterdir()] == ["report.html"]

@@ -72,7 +72,7 @@ LAWS = {
     "foundation": lambda: fc.Foundation(k_n=2e4, k_t=1e4, tension=False),
     "springs": lambda: fc.Coulomb(0.3, fc.NodalSprings(2e3), fc.NodalSprings(1e3)),
 }
-HOW = {
+ENFORCEMENTS = {
     "penalty": {},
     "augmented": {"enforcement": "augmented"},
     "draft": {"accuracy": "draft"},
@@ -80,19 +80,19 @@ HOW = {
 }
 
 
-def products() -> list[tuple]:
+def sample_of_options() -> list[tuple]:
     """Return a reproducible sample of combinations in which each choice occurs."""
     choices = itertools.product(
         ["fixed", "moving", "force", "ramp"],
         LAWS,
-        HOW,
+        ENFORCEMENTS,
         [None, "lbfgs", "newton"],
         ["plain", "estimate", "last", "every 3", "wall", "nonlinear"],
     )
     sensible = [
-        (obstacle, law, how, method, extra)
-        for obstacle, law, how, method, extra in choices
-        if not (law in ("foundation", "springs") and how != "penalty")
+        (obstacle, law, enforcement, method, extra)
+        for obstacle, law, enforcement, method, extra in choices
+        if not (law in ("foundation", "springs") and enforcement != "penalty")
         and not (law == "springs" and obstacle == "ramp")
         and not (law == "polygon" and obstacle != "fixed")
         and not (obstacle in ("ramp", "force") and extra in ("wall", "nonlinear"))
@@ -104,7 +104,7 @@ def products() -> list[tuple]:
 
 @pytest.mark.each
 @pytest.mark.newest
-@pytest.mark.parametrize(("obstacle", "law", "variant", "method", "extra"), products())
+@pytest.mark.parametrize(("obstacle", "law", "variant", "method", "extra"), sample_of_options())
 def test_restart_of_combined_options(obstacle, law, variant, method, extra, tmp_path):
     """Restarts agree for combined obstacles, laws, enforcement, methods and history options."""
     options = {}
@@ -116,7 +116,7 @@ def test_restart_of_combined_options(obstacle, law, variant, method, extra, tmp_
         options |= {"checkpoint_every": 3}
 
     def make():
-        contact = dict(HOW[variant])
+        contact = dict(ENFORCEMENTS[variant])
         if obstacle == "ramp":
             return BlockOnRamp(LAWS[law](), contact=contact, method=method)
         return BlockOnBallHistory(
@@ -145,27 +145,27 @@ def test_restart_after_cut_increments(make, tmp_path):
     Increments above 0.3 fail: those of 0.5 are halved, and grow again after two.
     """
 
-    def tamper(made):
-        problem, load, now, at = made.problem, made.load, [0.0], []
+    def tamper(setup):
+        problem, load, current, committed = setup.problem, setup.load, [0.0], []
         solve, commit = problem.solve, problem.commit
 
-        def note(t):
-            now[0] = t
-            at[:] = at or [t]  # the first is the committed load
+        def record_load(t):
+            current[0] = t
+            committed[:] = committed or [t]  # the first is the committed load
             load(t)
 
-        def choosy(**options):
-            if now[0] - at[0] > 0.3:
+        def solve_small_increments(**options):
+            if current[0] - committed[0] > 0.3:
                 balance = {"the body": fc.ForceBalance(1.0, 1.0, 0.0)}
                 verdict = fc.Verdict(balance, balance)
                 raise fc.NotConverged(problem.increment + 1, -1, verdict)
             return solve(**options)
 
-        def keep():
+        def commit_load():
             commit()
-            at[0] = now[0]
+            committed[0] = current[0]
 
-        made.load, problem.solve, problem.commit = note, choosy, keep
+        setup.load, problem.solve, problem.commit = record_load, solve_small_increments, commit_load
 
     assert_restart_equals_uninterrupted(make, shared_folder(tmp_path), stop=5, modify=tamper)
 
@@ -174,11 +174,11 @@ def test_error_estimate_of_a_restarted_state(tmp_path):
     """The error budget of a restarted history is that of the run that solved it (1e-6)."""
     path, budgets = shared_folder(tmp_path) / "state.npz", []
     for condensation in (True, True, False):
-        made = BlockOnBallHistory(condensation=condensation)
-        list(made.increments(checkpoint=path))
-        scene = made.scene
+        setup = BlockOnBallHistory(condensation=condensation)
+        list(setup.increments(checkpoint=path))
+        scene = setup.scene
         sigma = ufl.variable(strain(scene.u))  # not that of the form, but the same in all runs
-        budget = fc.estimate_errors(made.problem, 1000.0 * sigma, strain=strain(scene.u))
+        budget = fc.estimate_errors(setup.problem, 1000.0 * sigma, strain=strain(scene.u))
         budgets.append(budget.relative("enforcement"))
     for budget in budgets[1:]:
         for name, value in budgets[0].items():
@@ -188,27 +188,27 @@ def test_error_estimate_of_a_restarted_state(tmp_path):
 @pytest.mark.skipif(COMM.size > 1, reason="MUMPS adds in the order in which messages come")
 def test_repeated_histories_are_bit_identical():
     """L-BFGS does not depend on the memory addresses of its vectors, which other arrays shift."""
-    made, between = [], []
-    options = {"cell": "triangle", "n": 3, "method": "lbfgs", "contact": HOW["standard"]}
+    histories, between = [], []
+    options = {"cell": "triangle", "n": 3, "method": "lbfgs", "contact": ENFORCEMENTS["standard"]}
     for n in range(8):
         between.append([np.empty(13 * (n + 1) + i) for i in range(5)])
-        made.append(BlockOnBallHistory(fc.Tresca(0.3, 20.0), **options))
-        list(made[-1].increments(1.0))
-    for again in made[1:]:
-        assert find_differences(again, made[0], 0.0) == []
+        histories.append(BlockOnBallHistory(fc.Tresca(0.3, 20.0), **options))
+        list(histories[-1].increments(1.0))
+    for repeated in histories[1:]:
+        assert find_differences(repeated, histories[0], 0.0) == []
 
 
 SCRIPT = """
 import json
 from scenes.histories import BlockOnBallHistory, BlockOnRamp, collect_state
-made = {scene}
-for step in made.increments(checkpoint={path!r}):
+setup = {scene}
+for step in setup.increments(checkpoint={path!r}):
     if step.increment == {stop}:
         break
-found = collect_state(made)
-names = [n for n in found if n.split()[-1] in ("u", "history", "jump", "forces", "counts")]
-if made.problem.u.function_space.mesh.comm.rank == 0:
-    print(json.dumps({{n: found[n].tolist() for n in names}}))
+state = collect_state(setup)
+names = [n for n in state if n.split()[-1] in ("u", "history", "jump", "forces", "counts")]
+if setup.problem.u.function_space.mesh.comm.rank == 0:
+    print(json.dumps({{n: state[n].tolist() for n in names}}))
 """
 
 
@@ -251,11 +251,11 @@ def test_restart_on_another_number_of_ranks(scene, ranks, tmp_path):
 # ---- position in the load path -------------------------------------------------------------------
 
 
-def load_cycle(made, path, *, stop=0):
+def load_cycle(setup, path, *, stop=0):
     """Load to 2, unload to 1, reload to 2, stop after ``stop`` increments; return the loads."""
     loads = []
     for start, end, steps in ((0.0, 2.0, 4), (2.0, 1.0, 2), (1.0, 2.0, 2)):
-        for step in made.increments(end, start, steps=steps, checkpoint=path):
+        for step in setup.increments(end, start, steps=steps, checkpoint=path):
             loads.append(step.load)
             if len(loads) == stop:
                 return loads
@@ -267,37 +267,39 @@ def load_cycle(made, path, *, stop=0):
 def test_restart_within_several_calls_of_increments(make, stop, tmp_path):
     """Loading, unloading, reloading with one file are interrupted in and at the end of a call."""
     folder = shared_folder(tmp_path)
-    whole, broken, after = make(), make(), make()
-    loads = load_cycle(whole, folder / "whole.npz")
-    load_cycle(broken, folder / "part.npz", stop=stop)
+    uninterrupted, interrupted, after = make(), make(), make()
+    loads = load_cycle(uninterrupted, folder / "whole.npz")
+    load_cycle(interrupted, folder / "part.npz", stop=stop)
     assert load_cycle(after, folder / "part.npz") == loads[stop:]
-    assert find_differences(after, whole, 0.0 if COMM.size == 1 else 1e-7) == []
+    assert find_differences(after, uninterrupted, 0.0 if COMM.size == 1 else 1e-7) == []
 
 
 def test_calls_in_another_order_are_refused(tmp_path):
     """The second call is refused as the first one, and so is a first call with another end."""
     path = shared_folder(tmp_path) / "state.npz"
     load_cycle(BlockOnBallHistory(), path, stop=5)
-    made = BlockOnBallHistory()
-    call = lambda: next(made.increments(1.0, 2.0, steps=2, checkpoint=path))  # noqa: E731
+    setup = BlockOnBallHistory()
+    call = lambda: next(setup.increments(1.0, 2.0, steps=2, checkpoint=path))  # noqa: E731
     assert_raised_on_all_ranks(call, ValueError, "from 2 to 1 by 2", "from 0 to 2 by 4")
-    call = lambda: next(made.increments(2.5, 0.0, steps=5, checkpoint=path), None)  # noqa: E731
+    call = lambda: next(setup.increments(2.5, 0.0, steps=5, checkpoint=path), None)  # noqa: E731
     assert_raised_on_all_ranks(call, ValueError, "from 0 to 2.5 by 5", "from 0 to 2 by 4")
 
 
 def test_restart_with_later_end_or_other_remaining_steps(tmp_path):
     """A finished history is extended as if solved in one run; its remaining steps may differ."""
     folder = shared_folder(tmp_path)
-    first, further, whole = BlockOnBallHistory(), BlockOnBallHistory(), BlockOnBallHistory()
+    first, further, uninterrupted = BlockOnBallHistory(), BlockOnBallHistory(), BlockOnBallHistory()
     list(first.increments(2.0, checkpoint=folder / "state.npz"))
-    rest = [s.load for s in further.increments(4.0, checkpoint=folder / "state.npz")]
-    assert rest == [2.5, 3.0, 3.5, 4.0]
-    list(whole.increments(4.0, checkpoint=folder / "whole.npz"))
-    assert find_differences(further, whole, 0.0 if COMM.size == 1 else 1e-7) == []
+    remaining = [s.load for s in further.increments(4.0, checkpoint=folder / "state.npz")]
+    assert remaining == [2.5, 3.0, 3.5, 4.0]
+    list(uninterrupted.increments(4.0, checkpoint=folder / "whole.npz"))
+    assert find_differences(further, uninterrupted, 0.0 if COMM.size == 1 else 1e-7) == []
     other = BlockOnBallHistory()
     steps = [0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.1]
-    rest = [s.load for s in other.increments(4.1, steps=steps, checkpoint=folder / "state.npz")]
-    assert rest == [4.1]
+    remaining = [
+        s.load for s in other.increments(4.1, steps=steps, checkpoint=folder / "state.npz")
+    ]
+    assert remaining == [4.1]
 
 
 def test_restart_with_a_modulus_changed_by_the_load(tmp_path):
@@ -319,22 +321,22 @@ def test_restart_with_a_modulus_changed_by_the_load(tmp_path):
                 break
         return contact.resultants().force
 
-    whole = run(1.0, folder / "whole.npz")
+    uninterrupted = run(1.0, folder / "whole.npz")
     run(0.5, folder / "two.npz")
-    assert run(1.0, folder / "two.npz") == pytest.approx(whole, rel=1e-12, abs=1e-12)
+    assert run(1.0, folder / "two.npz") == pytest.approx(uninterrupted, rel=1e-12, abs=1e-12)
 
 
 def test_interrupted_loop_continues_with_other_steps(tmp_path):
     """The same call on the same problem, with other steps, continues the history (1e-7)."""
     path = shared_folder(tmp_path) / "state.npz"
-    made, whole = BlockOnBallHistory(), BlockOnBallHistory()
-    for step in made.increments(2.0, checkpoint=path):
+    setup, uninterrupted = BlockOnBallHistory(), BlockOnBallHistory()
+    for step in setup.increments(2.0, checkpoint=path):
         if step.increment == 2:
             break
-    rest = made.increments(2.0, steps=[0.5, 1.0, 1.25, 1.5, 2.0], checkpoint=path)
-    assert [s.load for s in rest] == [1.25, 1.5, 2.0]
-    list(whole.increments(2.0, steps=[0.5, 1.0, 1.25, 1.5, 2.0]))
-    assert find_differences(made, whole, 1e-7) == []
+    remaining = setup.increments(2.0, steps=[0.5, 1.0, 1.25, 1.5, 2.0], checkpoint=path)
+    assert [s.load for s in remaining] == [1.25, 1.5, 2.0]
+    list(uninterrupted.increments(2.0, steps=[0.5, 1.0, 1.25, 1.5, 2.0]))
+    assert find_differences(setup, uninterrupted, 1e-7) == []
 
 
 @pytest.mark.each
@@ -348,10 +350,12 @@ def test_restart_restores_results_of_a_finished_history(obstacle, enforcement, t
     """
 
     def make():
-        given = {"contact": {"enforcement": enforcement}}
+        contact_options = {"contact": {"enforcement": enforcement}}
         if obstacle == "rigid":
-            return BlockOnBallHistory(**given)
-        return BlockOnRamp(update_pairs="increment" if "anew" in obstacle else "never", **given)
+            return BlockOnBallHistory(**contact_options)
+        return BlockOnRamp(
+            update_pairs="increment" if "anew" in obstacle else "never", **contact_options
+        )
 
     end = 1.9  # at 2 the slip distance reaches a facet, the limit without pair updates
     path = shared_folder(tmp_path) / "state.npz"
@@ -365,26 +369,28 @@ def test_restart_restores_results_of_a_finished_history(obstacle, enforcement, t
     tolerance = 0.0 if COMM.size == 1 else 1e-12
     (first,) = one.problem.contacts
     slid = point_values(first, first.slip_increment)
-    for made in (one, called, loaded):
-        (contact,) = made.problem.contacts
-        found = contact.resultants()
-        assert (found.open, found.stick, found.slip) == (last.open, last.stick, last.slip)
+    for setup in (one, called, loaded):
+        (contact,) = setup.problem.contacts
+        computed = contact.resultants()
+        assert (computed.open, computed.stick, computed.slip) == (last.open, last.stick, last.slip)
         for name in ("force", "normal_force", "tangential_force", "area", "max_pressure"):
-            assert is_close(getattr(found, name), getattr(last, name), tolerance), name
+            assert is_close(getattr(computed, name), getattr(last, name), tolerance), name
         assert is_close(point_values(contact, contact.slip_increment), slid, tolerance)
 
 
 def test_restart_with_ranks_without_nodes(tmp_path):
     """A body of one cell, so that only one rank has nodes, agrees after the restart (1e-7)."""
     folder = shared_folder(tmp_path)
-    whole, stopped, after = (BlockOnBall(mesh={"n": 1}) for _ in range(3))
-    for _ in fc.increments(whole.problem, whole.load, 0.0, 2.0, steps=4):
+    uninterrupted, stopped, after = (BlockOnBall(mesh={"n": 1}) for _ in range(3))
+    for _ in fc.increments(uninterrupted.problem, uninterrupted.load, 0.0, 2.0, steps=4):
         pass
     options = {"steps": 4, "checkpoint": folder / "one.npz"}
     for step in fc.increments(stopped.problem, stopped.load, 0.0, 2.0, **options):
         if step.increment == 2:
             break
-    rest = list(fc.increments(after.problem, after.load, 0.0, 2.0, **options))
-    assert [step.increment for step in rest] == [3, 4]
-    assert is_close(owned_values(after.scene.u), owned_values(whole.scene.u), 1e-7)
-    assert is_close(after.contact.resultants().force, whole.contact.resultants().force, 1e-7)
+    remaining = list(fc.increments(after.problem, after.load, 0.0, 2.0, **options))
+    assert [step.increment for step in remaining] == [3, 4]
+    assert is_close(owned_values(after.scene.u), owned_values(uninterrupted.scene.u), 1e-7)
+    assert is_close(
+        after.contact.resultants().force, uninterrupted.contact.resultants().force, 1e-7
+    )

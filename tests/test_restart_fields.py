@@ -28,9 +28,9 @@ COMM = MPI.COMM_WORLD
 pytestmark = pytest.mark.mpi
 
 
-def more_fields(made: BlockOnBallHistory) -> list[fem.Function]:
+def fields_of_all_kinds(setup: BlockOnBallHistory) -> list[fem.Function]:
     """Return functions of all kinds that can be saved."""
-    mesh, submesh = made.scene.mesh, made.problem.contacts[0].surface.submesh
+    mesh, submesh = setup.scene.mesh, setup.problem.contacts[0].surface.submesh
     cell = mesh.basix_cell()
     d = mesh.geometry.dim
     spaces = {
@@ -52,7 +52,7 @@ def wave(x: np.ndarray, k: float) -> np.ndarray:
     return np.sin(3.0 * k + x @ np.array([2.3, 5.1, 3.7]))
 
 
-def fill(fields: list[fem.Function], k: float) -> None:
+def set_field_values(fields: list[fem.Function], k: float) -> None:
     """Set values that depend on the point, the component, the adjacent cell and ``k``."""
     for i, field in enumerate(fields):
         places = locate_nodes(field.function_space)
@@ -69,22 +69,22 @@ def fill(fields: list[fem.Function], k: float) -> None:
 def test_fields_of_every_kind_are_saved_and_restored(cell, tmp_path):
     """Fields are saved after an increment's loop body and set at restart, with ghosts, to 1e-12."""
     path = shared_folder(tmp_path) / "state.npz"
-    made, after = BlockOnBallHistory(cell=cell, n=2), BlockOnBallHistory(cell=cell, n=2)
-    fields = more_fields(made)
-    for step in made.increments(checkpoint=path, state_fields=fields):
-        fill(fields, step.increment)
+    setup, after = BlockOnBallHistory(cell=cell, n=2), BlockOnBallHistory(cell=cell, n=2)
+    fields = fields_of_all_kinds(setup)
+    for step in setup.increments(checkpoint=path, state_fields=fields):
+        set_field_values(fields, step.increment)
         if step.increment == 3:
             break
-    fields, expected = more_fields(after), more_fields(after)
+    fields, expected = fields_of_all_kinds(after), fields_of_all_kinds(after)
     # The loop was left in the third increment: the file has the second one.
-    fill(expected, 2)
+    set_field_values(expected, 2)
     steps = after.increments(checkpoint=path, state_fields=fields)
     assert next(steps).increment == 3
     for field, reference in zip(fields, expected, strict=True):
-        found, wanted = field.x.array, reference.x.array
-        assert is_close(gather(COMM, found), gather(COMM, wanted), 1e-12), field.name
+        computed, original = field.x.array, reference.x.array
+        assert is_close(gather(COMM, computed), gather(COMM, original), 1e-12), field.name
     other = BlockOnBallHistory(cell=cell, n=2)
-    fields = more_fields(other)
+    fields = fields_of_all_kinds(other)
     for wrong in (fields[:-1], [], fields[::-1], [*fields, other.plastic]):
         call = lambda wrong=wrong: next(  # noqa: E731
             other.increments(checkpoint=path, state_fields=wrong, on_mismatch="continue")
@@ -97,40 +97,42 @@ def test_restart_with_plastic_strains(bulk, tmp_path):
     """A restart with a strain that grows in the loop is bitwise the same, 1e-7 on several ranks."""
     folder = shared_folder(tmp_path)
 
-    def run(made, path, stop=0):
+    def run(setup, path, stop=0):
         grown = fem.Expression(
-            made.plastic + 0.1 * ufl.tr(strain(made.scene.u)),
-            compat.interpolation_points(made.plastic.function_space.element),
+            setup.plastic + 0.1 * ufl.tr(strain(setup.scene.u)),
+            compat.interpolation_points(setup.plastic.function_space.element),
         )
-        for step in made.increments(2.0, checkpoint=path, state_fields=[made.plastic]):
-            held = fem.Function(made.plastic.function_space)
-            held.interpolate(grown)
-            made.plastic.x.array[:] = held.x.array
+        for step in setup.increments(2.0, checkpoint=path, state_fields=[setup.plastic]):
+            previous_strain = fem.Function(setup.plastic.function_space)
+            previous_strain.interpolate(grown)
+            setup.plastic.x.array[:] = previous_strain.x.array
             if step.increment == stop:
                 break
 
-    whole, broken, after = (BlockOnBallHistory(bulk=bulk, n=4) for _ in range(3))
+    uninterrupted, interrupted, after = (BlockOnBallHistory(bulk=bulk, n=4) for _ in range(3))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*assumed small")
-        run(whole, folder / "whole.npz")
-        run(broken, folder / "part.npz", stop=3)
+        run(uninterrupted, folder / "whole.npz")
+        run(interrupted, folder / "part.npz", stop=3)
         run(after, folder / "part.npz")
-    assert np.abs(gather(COMM, owned_values(whole.plastic))).max() > 1e-4
+    assert np.abs(gather(COMM, owned_values(uninterrupted.plastic))).max() > 1e-4
     tolerance = 0.0 if COMM.size == 1 else 1e-7
-    assert find_differences(after, whole, tolerance) == []
+    assert find_differences(after, uninterrupted, tolerance) == []
     assert is_close(
-        gather(COMM, owned_values(after.plastic)), gather(COMM, owned_values(whole.plastic)), 1e-7
+        gather(COMM, owned_values(after.plastic)),
+        gather(COMM, owned_values(uninterrupted.plastic)),
+        1e-7,
     )
 
 
 def test_fields_missing_in_a_checkpoint_are_reported(tmp_path, caplog):
     """A field changed by the loop but not saved causes one warning, and a restart is refused."""
     path = shared_folder(tmp_path) / "state.npz"
-    made = BlockOnBallHistory(bulk="nonlinear")
+    setup = BlockOnBallHistory(bulk="nonlinear")
     with pytest.warns(UserWarning, match="plastic in the bulk form") as warned:
-        for step in made.increments(checkpoint=path):
-            made.plastic.x.array[:] = -1e-3 * step.increment
+        for step in setup.increments(checkpoint=path):
+            setup.plastic.x.array[:] = -1e-3 * step.increment
             if step.increment == 4:
                 break
     assert len([w for w in warned if "plastic" in str(w.message)]) == 1
@@ -142,8 +144,8 @@ def test_fields_missing_in_a_checkpoint_are_reported(tmp_path, caplog):
 def test_fields_that_cannot_be_saved_are_refused(tmp_path):
     """Fields that cannot be saved are named in an error when the history is set up."""
     path = shared_folder(tmp_path) / "state.npz"
-    made = BlockOnBallHistory()
-    mesh = made.scene.mesh
+    setup = BlockOnBallHistory()
+    mesh = setup.scene.mesh
     edges = fem.Function(fem.functionspace(mesh, ("RTCE", 1)), name="edges")
     bubbles = basix.ufl.element("bubble", mesh.basix_cell(), 3)  # four functions a cell
     bubbles = fem.Function(fem.functionspace(mesh, bubbles), name="bubbles")
@@ -156,11 +158,11 @@ def test_fields_that_cannot_be_saved_are_refused(tmp_path):
         (bubbles, "bubbles"),
         (mixed, "mixed"),
         (mixed.sub(0), "fields[0]"),
-        (made.scene.u, "displacement"),
-        (made.scene.E, "Constant"),
+        (setup.scene.u, "displacement"),
+        (setup.scene.E, "Constant"),
     ):
-        call = lambda field=field: made.increments(checkpoint=path, state_fields=[field])  # noqa: E731
+        call = lambda field=field: setup.increments(checkpoint=path, state_fields=[field])  # noqa: E731
         assert_raised_on_all_ranks(call, ValueError, word)
     assert_raised_on_all_ranks(
-        lambda: made.increments(state_fields=[made.plastic]), ValueError, "checkpoint"
+        lambda: setup.increments(state_fields=[setup.plastic]), ValueError, "checkpoint"
     )

@@ -31,8 +31,8 @@ pytestmark = pytest.mark.mpi
 def saved_checkpoint(tmp_path):
     """Return the path of a checkpoint of a history stopped after increment 3."""
     path = shared_folder(tmp_path) / "state.npz"
-    made = BlockOnBallHistory(wall=True)
-    for step in made.increments(checkpoint=path):
+    setup = BlockOnBallHistory(wall=True)
+    for step in setup.increments(checkpoint=path):
         if step.increment == 3:
             break
     return path
@@ -72,36 +72,39 @@ def test_changed_data_are_refused(other, saved_checkpoint):
     """
     options, words = OTHER[other]
     options = {n: v() if callable(v) else v for n, v in options.items()}
-    made, fresh = BlockOnBallHistory(wall=True, **options), BlockOnBallHistory(wall=True, **options)
+    setup, fresh = (
+        BlockOnBallHistory(wall=True, **options),
+        BlockOnBallHistory(wall=True, **options),
+    )
     before = saved_checkpoint.read_bytes()
-    call = lambda: next(made.increments(checkpoint=saved_checkpoint))  # noqa: E731
+    call = lambda: next(setup.increments(checkpoint=saved_checkpoint))  # noqa: E731
     assert_raised_on_all_ranks(
         call, ValueError, str(saved_checkpoint), *words, "remove it", "continue"
     )
-    assert made.problem.increment == 0 and saved_checkpoint.read_bytes() == before
-    assert [c.value.max() for c in made.push] == [0.0, 0.0]
+    assert setup.problem.increment == 0 and saved_checkpoint.read_bytes() == before
+    assert [c.value.max() for c in setup.push] == [0.0, 0.0]
     # The problem is as if there had been no file.
-    for each in (made, fresh):
+    for each in (setup, fresh):
         each.load(0.5)
         each.problem.solve()
         each.problem.commit()
-    assert find_differences(made, fresh, 0.0 if COMM.size == 1 else 1e-7) == []
-    told = BlockOnBallHistory(wall=True, **options)
-    step = next(told.increments(checkpoint=saved_checkpoint, on_mismatch="continue"))
+    assert find_differences(setup, fresh, 0.0 if COMM.size == 1 else 1e-7) == []
+    expected = BlockOnBallHistory(wall=True, **options)
+    step = next(expected.increments(checkpoint=saved_checkpoint, on_mismatch="continue"))
     assert step.increment == 4 and step.load == 2.0
 
 
 def test_other_loads_and_conditions_are_refused(saved_checkpoint):
     """An additional load, and another value or component of a condition, are refused."""
-    made = BlockOnBallHistory(wall=True)
-    made.scene.load(side=1.0)
-    call = lambda: next(made.increments(checkpoint=saved_checkpoint))  # noqa: E731
+    setup = BlockOnBallHistory(wall=True)
+    setup.scene.load(side=1.0)
+    call = lambda: next(setup.increments(checkpoint=saved_checkpoint))  # noqa: E731
     assert_raised_on_all_ranks(call, ValueError, "loads of the bulk", "v·f")
-    made = BlockOnBallHistory(wall=True)
-    load = made.load
-    made.load = lambda t: load(1.01 * t)
+    setup = BlockOnBallHistory(wall=True)
+    load = setup.load
+    setup.load = lambda t: load(1.01 * t)
     assert_raised_on_all_ranks(call, ValueError, "a value prescribed by a Dirichlet condition")
-    made = BlockOnBallHistory(wall=True, prescribed_components=[1])
+    setup = BlockOnBallHistory(wall=True, prescribed_components=[1])
     assert_raised_on_all_ranks(call, ValueError, "Dirichlet conditions", "components of nodes")
 
 
@@ -126,20 +129,20 @@ def test_incompatible_checkpoints_are_always_refused(other, saved_checkpoint):
     options, words = FIXED[other]
     options = {n: v() if callable(v) else v for n, v in options.items()}
     for changed in ("refuse", "continue"):
-        made = BlockOnBallHistory(**({"wall": True} | options))
-        call = lambda made=made, changed=changed: next(  # noqa: E731
-            made.increments(checkpoint=saved_checkpoint, on_mismatch=changed)
+        setup = BlockOnBallHistory(**({"wall": True} | options))
+        call = lambda setup=setup, changed=changed: next(  # noqa: E731
+            setup.increments(checkpoint=saved_checkpoint, on_mismatch=changed)
         )
         assert_raised_on_all_ranks(call, ValueError, *words)
-        assert made.problem.increment == 0
+        assert setup.problem.increment == 0
 
 
 def test_mesh_with_displaced_nodes_is_refused(saved_checkpoint):
     """The number of nodes is the same, but some are displaced by 1e-6 of the body's size."""
-    made = BlockOnBallHistory(wall=True)
-    x = made.scene.mesh.geometry.x
+    setup = BlockOnBallHistory(wall=True)
+    x = setup.scene.mesh.geometry.x
     x[np.all(np.abs(x[:, :2] - 0.5) < 1e-9, axis=1), 0] += 1e-6
-    call = lambda: next(made.increments(checkpoint=saved_checkpoint, on_mismatch="continue"))  # noqa: E731
+    call = lambda: next(setup.increments(checkpoint=saved_checkpoint, on_mismatch="continue"))  # noqa: E731
     assert_raised_on_all_ranks(call, ValueError, "nodes", "locations")
 
 
@@ -152,16 +155,16 @@ def test_data_changed_by_the_load_are_accepted(tmp_path):
             super().load(t)
             self.problem.contacts[0].parameters["friction"].value = 0.1 + 0.1 * t
 
-    made, after = Both(obstacle="moving"), Both(obstacle="moving")
-    next(made.increments(checkpoint=path))
+    setup, after = Both(obstacle="moving"), Both(obstacle="moving")
+    next(setup.increments(checkpoint=path))
     assert [s.increment for s in after.increments(checkpoint=path)] == list(range(2, 9))
 
 
 def test_nonlinear_bulk_is_compared_at_the_stored_state(tmp_path):
     """Two bodies whose stiffness differs only when they are deformed are distinguished."""
     path = shared_folder(tmp_path) / "state.npz"
-    made = BlockOnBallHistory(bulk="nonlinear")
-    next(made.increments(checkpoint=path))
+    setup = BlockOnBallHistory(bulk="nonlinear")
+    next(setup.increments(checkpoint=path))
     other = BlockOnBallHistory(bulk="less stiffening")
     assert_raised_on_all_ranks(
         lambda: next(other.increments(checkpoint=path)), ValueError, "stiffness of the bulk"
@@ -172,16 +175,16 @@ def test_uncommitted_state_is_not_saved(tmp_path):
     """Before `commit` or `restore` nothing is written; after it, the committed state is saved."""
     path = shared_folder(tmp_path) / "state.npz"
     for end in ("commit", "restore"):
-        made = BlockOnBallHistory()
-        next(made.increments())
-        made.load(1.0)
-        made.problem.solve(recover_interior=False)
+        setup = BlockOnBallHistory()
+        next(setup.increments())
+        setup.load(1.0)
+        setup.problem.solve(recover_interior=False)
         assert_raised_on_all_ranks(
-            lambda m=made: checkpoint.save(m.problem, path), ValueError, "commit()"
+            lambda m=setup: checkpoint.save(m.problem, path), ValueError, "commit()"
         )
-        assert not checkpoint.exists(made.problem, path)
-        getattr(made.problem, end)()
-        checkpoint.save(made.problem, path)
+        assert not checkpoint.exists(setup.problem, path)
+        getattr(setup.problem, end)()
+        checkpoint.save(setup.problem, path)
         COMM.barrier()
         after = BlockOnBallHistory()
         after.load(1.0)
@@ -209,18 +212,18 @@ def test_other_load_paths_are_refused(saved_checkpoint):
         {"start": 0.25, "steps": 8},
         {"end": 5.0, "steps": 8},
     ):
-        made = BlockOnBallHistory(wall=True)
-        call = lambda made=made, a=arguments: next(  # noqa: E731
-            made.increments(checkpoint=saved_checkpoint, **a)
+        setup = BlockOnBallHistory(wall=True)
+        call = lambda setup=setup, a=arguments: next(  # noqa: E731
+            setup.increments(checkpoint=saved_checkpoint, **a)
         )
         text = assert_raised_on_all_ranks(
             call, ValueError, "another load path", "from 0 to 4 by 8", "1.5"
         )
         assert f"to {arguments.get('end', 4.0):g} by" in text
-        assert made.problem.increment == 0
-    made = BlockOnBallHistory(wall=True)
-    made.increments(estimate=True)
-    call = lambda: next(made.increments(checkpoint=saved_checkpoint, estimate=True))  # noqa: E731
+        assert setup.problem.increment == 0
+    setup = BlockOnBallHistory(wall=True)
+    setup.increments(estimate=True)
+    call = lambda: next(setup.increments(checkpoint=saved_checkpoint, estimate=True))  # noqa: E731
     assert_raised_on_all_ranks(call, ValueError, "estimate")
 
 
@@ -231,7 +234,7 @@ def test_flipped_bits_and_truncated_files_are_detected(saved_checkpoint):
     """Damage anywhere is refused; the problem is unchanged, and then reads the intact file."""
     content = saved_checkpoint.read_bytes()
     COMM.barrier()
-    made, n = BlockOnBallHistory(wall=True), len(content)
+    setup, n = BlockOnBallHistory(wall=True), len(content)
     rng = np.random.default_rng(1)
     places = [0, 3, 8, 26, n - 1, n - 64, n - 70, n - 120, *rng.integers(0, n, 30)]
     bad = [content[:i] for i in (0, 1, 100, n // 2, n - 1, n - 64, n - 200)]
@@ -240,11 +243,11 @@ def test_flipped_bits_and_truncated_files_are_detected(saved_checkpoint):
         bad.append(content[:i] + bytes([content[i] ^ 1 << int(rng.integers(8))]) + content[i + 1 :])
     for damaged in bad:
         write(saved_checkpoint, damaged)
-        call = lambda: next(made.increments(checkpoint=saved_checkpoint))  # noqa: E731
+        call = lambda: next(setup.increments(checkpoint=saved_checkpoint))  # noqa: E731
         assert_raised_on_all_ranks(call, ValueError, str(saved_checkpoint), "remove it")
-    assert made.problem.increment == 0 and not np.any(owned_values(made.scene.u))
+    assert setup.problem.increment == 0 and not np.any(owned_values(setup.scene.u))
     write(saved_checkpoint, content)
-    assert next(made.increments(checkpoint=saved_checkpoint)).increment == 4
+    assert next(setup.increments(checkpoint=saved_checkpoint)).increment == 4
 
 
 def write(path: Path, content: bytes) -> None:
@@ -258,8 +261,8 @@ def write(path: Path, content: bytes) -> None:
 def test_other_file_formats_are_refused(tmp_path):
     """Texts, arrays, other archives and checkpoints of another format are refused."""
     path = shared_folder(tmp_path) / "state.npz"
-    made = BlockOnBallHistory()
-    call = lambda: next(made.increments(checkpoint=path))  # noqa: E731
+    setup = BlockOnBallHistory()
+    call = lambda: next(setup.increments(checkpoint=path))  # noqa: E731
     if COMM.rank == 0:
         path.write_text("not a checkpoint\n" * 100)
     assert_raised_on_all_ranks(call, ValueError, "no checkpoint")
@@ -299,34 +302,36 @@ def make_corruption(name):
 
 
 @pytest.mark.each
-@pytest.mark.parametrize("how", ["nan", "complex", "single", "words", "scalar", "short", "none"])
-@pytest.mark.parametrize("what", ["nodes", "contact floor", "stiffness", "state", "numbers"])
-def test_corrupted_arrays_are_refused(what, how, saved_checkpoint):
+@pytest.mark.parametrize(
+    "corruption", ["nan", "complex", "single", "words", "scalar", "short", "none"]
+)
+@pytest.mark.parametrize("array", ["nodes", "contact floor", "stiffness", "state", "numbers"])
+def test_corrupted_arrays_are_refused(array, corruption, saved_checkpoint):
     """A file with a valid checksum is refused if an array is missing, not finite or mistyped."""
     if COMM.rank == 0:
         scene, arrays = checkpoint_file.read_file(saved_checkpoint)
-        change = make_corruption(how)
+        change = make_corruption(corruption)
         if change is None:
-            del arrays[what]
+            del arrays[array]
         else:
-            arrays[what] = np.asarray(change(arrays[what]))
+            arrays[array] = np.asarray(change(arrays[array]))
         checkpoint_file.write_file(saved_checkpoint, scene, arrays)
     COMM.barrier()
-    made = BlockOnBallHistory(wall=True)
-    call = lambda: next(made.increments(checkpoint=saved_checkpoint))  # noqa: E731
-    missing = ["it lacks numbers"] * ((what, how) == ("numbers", "none"))
+    setup = BlockOnBallHistory(wall=True)
+    call = lambda: next(setup.increments(checkpoint=saved_checkpoint))  # noqa: E731
+    missing = ["it lacks numbers"] * ((array, corruption) == ("numbers", "none"))
     assert_raised_on_all_ranks(call, ValueError, str(saved_checkpoint), *missing)
-    assert made.problem.increment == 0 and not np.any(owned_values(made.scene.u))
-    assert [float(c.value) for c in made.push] == [0.0, 0.0]
+    assert setup.problem.increment == 0 and not np.any(owned_values(setup.scene.u))
+    assert [float(c.value) for c in setup.push] == [0.0, 0.0]
 
 
 def test_unreadable_files_and_missing_folders_are_refused(saved_checkpoint, monkeypatch):
     """A folder or an unreadable file raises OSError; a missing folder is refused at the call."""
-    made, folder = BlockOnBallHistory(wall=True), saved_checkpoint.parent
-    call = lambda path: next(made.increments(checkpoint=path))  # noqa: E731
+    setup, folder = BlockOnBallHistory(wall=True), saved_checkpoint.parent
+    call = lambda path: next(setup.increments(checkpoint=path))  # noqa: E731
     assert_raised_on_all_ranks(lambda: call(folder), OSError)
     assert_raised_on_all_ranks(
-        lambda: made.increments(checkpoint=folder / "none" / "x.npz"), ValueError, "no folder"
+        lambda: setup.increments(checkpoint=folder / "none" / "x.npz"), ValueError, "no folder"
     )
 
     def refuse(*args):
@@ -335,24 +340,24 @@ def test_unreadable_files_and_missing_folders_are_refused(saved_checkpoint, monk
     with monkeypatch.context() as patch:
         patch.setattr(Path, "read_bytes", refuse)
         assert_raised_on_all_ranks(lambda: call(saved_checkpoint), OSError, "Permission denied")
-    assert made.problem.increment == 0
+    assert setup.problem.increment == 0
 
 
 def test_failing_load_function_leaves_the_problem_unchanged(saved_checkpoint):
     """The function that sets the loads raises at the stored load."""
-    made = BlockOnBallHistory(wall=True)
-    load = made.load
+    setup = BlockOnBallHistory(wall=True)
+    load = setup.load
 
-    def failing(t):
+    def raise_error(t):
         if t > 1.0:
             raise ValueError("no such load")
         load(t)
 
-    made.load = failing
+    setup.load = raise_error
     assert_raised_on_all_ranks(
-        lambda: next(made.increments(checkpoint=saved_checkpoint)), ValueError, "no such load"
+        lambda: next(setup.increments(checkpoint=saved_checkpoint)), ValueError, "no such load"
     )
-    assert made.problem.increment == 0 and not np.any(owned_values(made.scene.u))
+    assert setup.problem.increment == 0 and not np.any(owned_values(setup.scene.u))
 
 
 def test_coinciding_cells_cannot_be_saved(tmp_path):
@@ -382,16 +387,16 @@ def test_increments_without_iteration_warn(caplog):
 
     It is logged, too: FFCx hides Python's warnings if no logging has been set up.
     """
-    made = BlockOnBallHistory()
+    setup = BlockOnBallHistory()
     with pytest.warns(RuntimeWarning, match="iterate over"):
-        made.increments()
-    assert made.problem.increment == 0
+        setup.increments()
+    assert setup.problem.increment == 0
     assert caplog.text.count("nothing was solved") == (COMM.rank == 0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*assumed small")
-        next(made.increments(1.0))
-    assert made.problem.increment == 1
+        next(setup.increments(1.0))
+    assert setup.problem.increment == 1
 
 
 @pytest.mark.whole
@@ -415,7 +420,7 @@ def test_increments_without_iteration_warn(caplog):
 )
 def test_arguments_are_checked_at_the_call(arguments, words):
     """Arguments are checked by the call of `increments`, not by its first increment."""
-    made = BlockOnBallHistory()
-    arguments = {"load": made.load, "start": 0.0, "end": 1.0} | arguments
-    call = lambda: fc.increments(made.problem, **arguments)  # noqa: E731
+    setup = BlockOnBallHistory()
+    arguments = {"load": setup.load, "start": 0.0, "end": 1.0} | arguments
+    call = lambda: fc.increments(setup.problem, **arguments)  # noqa: E731
     assert_raised_on_all_ranks(call, ValueError, *words)

@@ -87,9 +87,9 @@ def brute_distance(points, facets, x):
         for subset in subsets:
             base, *others = corner[subset]
             span = np.array(others).reshape(len(others), x.shape[1]) - base
-            share = (x - base) @ np.linalg.pinv(span) if others else np.zeros((len(x), 0))
-            within = np.all(share >= 0, axis=1) & (share.sum(axis=1) <= 1)
-            away = np.linalg.norm(x - base - share @ span, axis=1)
+            coordinates = (x - base) @ np.linalg.pinv(span) if others else np.zeros((len(x), 0))
+            within = np.all(coordinates >= 0, axis=1) & (coordinates.sum(axis=1) <= 1)
+            away = np.linalg.norm(x - base - coordinates @ span, axis=1)
             least = np.where(within, np.minimum(least, away), least)
     return least
 
@@ -109,7 +109,7 @@ def winding(points, facets, x):
     return (2 * np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb)).sum(1) / (4 * np.pi)
 
 
-def places(points, n=600):
+def sample_points(points, n=600):
     """Return points near and far, inside and outside, and close to corners."""
     d = points.shape[1]
     wide = RNG.uniform(-1.6, 1.6, size=(n, d))
@@ -122,13 +122,13 @@ def places(points, n=600):
 def test_signed_distance_of_a_surface(name):
     """Reference: the least distance from all facets, signed by the winding number; 1e-12."""
     points, facets = SURFACES[name]()
-    surface, x = fc.RigidSurface(points, facets), places(points)
-    found = surface.sample(x).distance
+    surface, x = fc.RigidSurface(points, facets), sample_points(points)
+    computed = surface.sample(x).distance
     inside = winding(points, facets, x)
     assert np.allclose(inside, np.round(inside), atol=1e-6)
     assert 50 < np.sum(inside > 0.5) < len(x) - 50
     signed = np.where(inside > 0.5, -1.0, 1.0) * brute_distance(points, facets, x)
-    assert np.abs(found - signed).max() < 1e-12
+    assert np.abs(computed - signed).max() < 1e-12
     assert surface.facets.closed
 
 
@@ -141,28 +141,28 @@ def test_normal_and_curvature_are_derivatives(name):
     """
     if name in SURFACES:
         points, facets = SURFACES[name]()
-        obstacle, x = fc.RigidSurface(points, facets), places(points)
+        obstacle, x = fc.RigidSurface(points, facets), sample_points(points)
     else:
         obstacle, x = _wavy(name)
     d, step = x.shape[1], 1e-6
-    here = obstacle.sample(x)
+    sample = obstacle.sample(x)
     slope, bend = np.empty((len(x), d)), np.empty((len(x), d, d))
-    size = 1 + np.abs(here.curvature).max(axis=(1, 2))
-    same = np.abs(here.distance) > 1e-3
+    size = 1 + np.abs(sample.curvature).max(axis=(1, 2))
+    same = np.abs(sample.distance) > 1e-3
     for i, e in enumerate(np.eye(d)):
         ahead, behind = obstacle.sample(x + step * e), obstacle.sample(x - step * e)
         slope[:, i] = (ahead.distance - behind.distance) / (2 * step)
         bend[:, i] = -(ahead.normal - behind.normal) / (2 * step)
         for side in (ahead, behind):
-            same &= np.abs(side.curvature - here.curvature).max(axis=(1, 2)) < 0.01 * size
-            same &= np.abs(side.normal - here.normal).max(axis=1) < 2 * step * size
-    assert np.abs(np.linalg.norm(here.normal, axis=1) - 1).max() < 1e-12
+            same &= np.abs(side.curvature - sample.curvature).max(axis=(1, 2)) < 0.01 * size
+            same &= np.abs(side.normal - sample.normal).max(axis=1) < 2 * step * size
+    assert np.abs(np.linalg.norm(sample.normal, axis=1) - 1).max() < 1e-12
     assert np.mean(same) > 0.95
-    wrong = np.abs(slope + here.normal).max(axis=1)
+    wrong = np.abs(slope + sample.normal).max(axis=1)
     assert np.all((wrong < 1e-8 + 3 * (step * size) ** 2)[same])
-    wrong = np.abs(bend - here.curvature).max(axis=(1, 2))
+    wrong = np.abs(bend - sample.curvature).max(axis=(1, 2))
     assert np.all((wrong < 1e-8 * size + 10 * step**2 * size**3)[same])
-    assert np.abs(here.curvature - np.swapaxes(here.curvature, 1, 2)).max() < 1e-12 * size.max()
+    assert np.abs(sample.curvature - np.swapaxes(sample.curvature, 1, 2)).max() < 1e-12 * size.max()
 
 
 def _wavy(name):
@@ -183,9 +183,9 @@ def test_normal_and_curvature_at_edges_and_corners():
     """On a box the normal is the pseudo-normal, and nearby points have the sign of their side."""
     points, facets = box((-1, -1, -1), (1, 1, 1))
     obstacle = fc.RigidSurface(points, facets)
-    found = obstacle.sample(points)
-    assert np.abs(found.distance).max() == 0.0
-    assert is_close(found.normal, -points / np.sqrt(3), 1e-12)
+    computed = obstacle.sample(points)
+    assert np.abs(computed.distance).max() == 0.0
+    assert is_close(computed.normal, -points / np.sqrt(3), 1e-12)
     middle = np.array([[1.0, 1.0, 0.2], [-1.0, 0.1, 1.0]])
     expected = -middle * [[1, 1, 0], [1, 0, 1]] / np.sqrt(2)
     assert is_close(obstacle.sample(middle).normal, expected, 1e-12)
@@ -207,15 +207,15 @@ def test_points_beyond_the_border_of_an_open_surface_are_outside():
     x = np.array([[0.2, 0.3], [0.2, -0.3], [1.3, 0.4], [1.3, -0.4], [-1.0 - 1e-6, -0.5]])
     assert not floor.facets.closed
     for obstacle in (floor, fc.RigidProfile([[1.0, 0.0], [0.3, 0.0], [-1.0, 0.0]])):
-        found = obstacle.sample(x)
-        assert is_close(found.distance, [0.3, -0.3, 0.5, 0.5, 0.5], 1e-9)
-        assert is_close(found.normal[:2], [[0, -1], [0, -1]], 1e-9)
-        assert is_close(found.normal[3], np.array([-0.6, 0.8]), 1e-9)
+        computed = obstacle.sample(x)
+        assert is_close(computed.distance, [0.3, -0.3, 0.5, 0.5, 0.5], 1e-9)
+        assert is_close(computed.normal[:2], [[0, -1], [0, -1]], 1e-9)
+        assert is_close(computed.normal[3], np.array([-0.6, 0.8]), 1e-9)
 
 
 def test_distance_of_a_faceted_ball_converges():
     """When edges are halved, the error of the distance falls by a factor of four, within 3 to 5."""
-    x = places(ball(1)[0], 300)
+    x = sample_points(ball(1)[0], 300)
     x = x[np.linalg.norm(x, axis=1) > 0.3]
     exact = np.linalg.norm(x, axis=1) - 1
     errors = [np.abs(fc.RigidSurface(*ball(n)).sample(x).distance - exact).max() for n in (2, 3, 4)]
@@ -229,15 +229,15 @@ def test_halvings_approach_a_smooth_surface():
     Distance errors on a cylinder of 40 needles and on its rim fall to 1/5; its caps, and a box,
     remain flat (1e-12).
     """
-    x = places(ball(1)[0], 300)
+    x = sample_points(ball(1)[0], 300)
     x = x[np.linalg.norm(x, axis=1) > 0.3]
     length = np.linalg.norm(x, axis=1)
     errors = []
     for halvings in (0, 2):
         surface = fc.RigidSurface(*ball(3), halvings=halvings)
-        found = surface.sample(x)
-        turn = np.abs(found.normal + x / length[:, None]).max()
-        errors.append((np.abs(found.distance - length + 1).max(), turn))
+        computed = surface.sample(x)
+        turn = np.abs(computed.normal + x / length[:, None]).max()
+        errors.append((np.abs(computed.distance - length + 1).max(), turn))
         assert surface.facets.closed and len(surface.facets.facets) == 512 * 4**halvings
     assert errors[0][0] > 5 * errors[1][0] and errors[0][1] > 3 * errors[1][1]
 
@@ -256,9 +256,9 @@ def test_halvings_approach_a_smooth_surface():
     assert is_close(bent.sample(above).distance, np.ones(200), 1e-12)
 
     points, facets = box((-1, -1, -1), (1, 1, 1))
-    z = places(points, 100)
-    whole, parts = (fc.RigidSurface(points, facets, halvings=n).sample(z) for n in (0, 2))
-    assert is_close(parts.distance, whole.distance, 1e-12)
+    z = sample_points(points, 100)
+    unsplit, parts = (fc.RigidSurface(points, facets, halvings=n).sample(z) for n in (0, 2))
+    assert is_close(parts.distance, unsplit.distance, 1e-12)
 
 
 def test_distant_points_and_no_points():
@@ -282,8 +282,8 @@ def test_many_points_and_facets():
     obstacle = fc.RigidSurface(*ball(7))
     x = RNG.normal(size=(10_000, 3))
     x *= (RNG.uniform(0.95, 1.1, size=10_000) / np.linalg.norm(x, axis=1))[:, None]
-    found = obstacle.sample(x)
-    assert np.abs(found.distance - np.linalg.norm(x, axis=1) + 1).max() < 1.1e-4
+    computed = obstacle.sample(x)
+    assert np.abs(computed.distance - np.linalg.norm(x, axis=1) + 1).max() < 1.1e-4
 
 
 def test_spline_through_points_of_a_circle():
@@ -306,12 +306,12 @@ def test_spline_through_points_of_a_circle():
     ):
         arm = (place - (1 if obstacle.gdim == 3 and np.trace(matrix) > 2.5 else 0)) @ matrix
         length = np.linalg.norm(arm, axis=1)
-        kept = length > 0.25
-        found, n = obstacle.sample(place[kept]), arm[kept] / length[kept, None]
-        assert is_close(found.distance, length[kept] - radius, 1e-8, scale=1.0)
-        assert is_close(found.normal, -n, 1e-5)
-        bend = (matrix - np.einsum("ni,nj->nij", n, n)) / length[kept, None, None]
-        assert is_close(found.curvature, bend, 1e-3)
+        outside = length > 0.25
+        computed, n = obstacle.sample(place[outside]), arm[outside] / length[outside, None]
+        assert is_close(computed.distance, length[outside] - radius, 1e-8, scale=1.0)
+        assert is_close(computed.normal, -n, 1e-5)
+        bend = (matrix - np.einsum("ni,nj->nij", n, n)) / length[outside, None, None]
+        assert is_close(computed.curvature, bend, 1e-3)
 
 
 # ---- files ---------------------------------------------------------------------------------------
@@ -326,12 +326,12 @@ def test_stl_files(binary, tmp_path):
         write_stl(folder / "ball.stl", 1e3 * points, facets, binary=binary)
     COMM.barrier()
     read = fc.RigidSurface.from_stl(folder / "ball.stl", scale=1e-3)
-    x = places(points, 50)
-    given = fc.RigidSurface(points, facets).sample(x)
+    x = sample_points(points, 50)
+    expected = fc.RigidSurface(points, facets).sample(x)
     # A binary file has single precision: relative round-off 6e-8.
     allowed = 1e-6 if binary else 1e-12
     assert read.facets.closed and len(read.facets.facets) == len(facets)
-    assert is_close(read.sample(x).distance, given.distance, allowed)
+    assert is_close(read.sample(x).distance, expected.distance, allowed)
     if COMM.rank == 0:
         (folder / "none.stl").write_text("solid nothing\nendsolid nothing\n")
     COMM.barrier()
@@ -380,8 +380,8 @@ def test_data_of_wrong_dimension_or_different_by_rank_are_refused():
     law = fc.Frictionless(1e3)
     flat = fc.RigidProfile(circle(9), closed=True)
     assert_raised_on_all_ranks(lambda: scene.contact(flat, law), ValueError, "2 dimensions")
-    own = fc.RigidSurface(*ball(1, 1.0 + COMM.rank))
+    different_by_rank = fc.RigidSurface(*ball(1, 1.0 + COMM.rank))
     if COMM.size > 1:
         assert_raised_on_all_ranks(
-            lambda: scene.contact(own, law), ValueError, "differ between ranks"
+            lambda: scene.contact(different_by_rank, law), ValueError, "differ between ranks"
         )

@@ -23,14 +23,14 @@ from verification.fuzz_setup import run_history
 COMM = MPI.COMM_WORLD
 TIMES = np.linspace(0.25, 2.0, 8)
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(300)]
-WAYS = [
+SOLVER_OPTIONS = [
     {},
     {"method": "lbfgs", "condensation": False},
     {"method": "newton", "condensation": False},
 ]
 
 
-def pressed(stiffness: float, carried: float, **options) -> tuple[Array, fc.Step]:
+def press_block_on_slab(stiffness: float, carried: float, **options) -> tuple[Array, fc.Step]:
     """Return the contact force of a block, and the step.
 
     The block, E = 1, is on a slab ``stiffness`` times as stiff; both are displaced by ``carried``.
@@ -48,7 +48,7 @@ def pressed(stiffness: float, carried: float, **options) -> tuple[Array, fc.Step
 
 
 @pytest.mark.each
-@pytest.mark.parametrize("options", WAYS, ids=["condensed", "lbfgs", "newton"])
+@pytest.mark.parametrize("options", SOLVER_OPTIONS, ids=["condensed", "lbfgs", "newton"])
 @pytest.mark.parametrize(
     ("stiffness", "carried"), [(1e6, 10.0), (1e8, 10.0), (1e9, 10.0), (1e12, 0.3)]
 )
@@ -59,18 +59,20 @@ def test_soft_block_on_a_displaced_stiff_slab(stiffness, carried, options):
     force was off by 0.25 to 6 %. The tolerance is 1e-9 of the forces; displacements of 10 have a
     round-off of 1e-15, and the block is pressed by 1e-2.
     """
-    expected, still = pressed(stiffness, 0.0, **options)
+    expected, undisplaced = press_block_on_slab(stiffness, 0.0, **options)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        found, step = pressed(stiffness, carried, **options)
-    assert is_close(found, expected, 1e-8)
+        computed, step = press_block_on_slab(stiffness, carried, **options)
+    assert is_close(computed, expected, 1e-8)
     inexact = step.verdict.inexact
     assert set(inexact) <= {"body 1"}
-    said = [str(w.message) for w in caught if "round-off of its displacements" in str(w.message)]
-    assert len(said) == len(inexact)
+    messages = [
+        str(w.message) for w in caught if "round-off of its displacements" in str(w.message)
+    ]
+    assert len(messages) == len(inexact)
     assert bool(inexact) == (stiffness > 1e7)
     # Translation costs no iterations. Measured: 3 of 3 by Newton's method, 2 or 3 of 7 by L-BFGS.
-    assert step.iterations <= still.iterations + 1
+    assert step.iterations <= undisplaced.iterations + 1
 
 
 def test_unconstrained_stiff_slab_between_blocks():
@@ -80,7 +82,7 @@ def test_unconstrained_stiff_slab_between_blocks():
     stiffness of the blocks the forces balance, to 1e-8.
     """
 
-    def between(stiffness):
+    def press_between_bodies(stiffness):
         slab = Box((-0.5, -0.2), (2.0, 0.2), (6, 2), stiffness)
         scene = SceneWithUnrelatedBodies({"low": Box((0.0, -1.2)), "slab": slab, "high": Box()})
         along = scene.bodies.constant(0.3)
@@ -95,9 +97,11 @@ def test_unconstrained_stiff_slab_between_blocks():
         step = scene.problem(*joints, fallback=False, method="newton").solve()
         return [step.contacts[joint.name].force for joint in joints]
 
-    high, low = between(1.0)
+    high, low = press_between_bodies(1.0)
     assert is_close(high + low, 0 * high, 1e-8 * np.linalg.norm(high), scale=1.0)
-    assert_raised_on_all_ranks(lambda: between(1e12), fc.NotConverged, "with a round-off of")
+    assert_raised_on_all_ranks(
+        lambda: press_between_bodies(1e12), fc.NotConverged, "with a round-off of"
+    )
 
 
 @pytest.mark.each
@@ -119,20 +123,20 @@ def test_round_off_of_a_load_counts_as_zero(kinematics, E):
         floor = fc.HalfSpace((0, -1e-3), (0, 1))
         contact = scene.contact("block", BOTTOM, floor, fc.Coulomb(0.3), kinematics=kinematics)
         problem = scene.problem(contact, small_displacement_tolerance=np.inf)
-        found = []
+        computed = []
         for time, value in zip(TIMES, loads, strict=True):
             load.value, along.value = -1e-2 * E * value, 0.3 * time
             problem.solve()
             problem.commit()
-            found.append(contact.resultants().force)
-        return np.array(found)
+            computed.append(contact.resultants().force)
+        return np.array(computed)
 
     sine = np.sin(np.pi * TIMES)
     exact = np.where(np.isclose(sine, 0.0), 0.0, sine)
     assert np.any((sine != 0) & (exact == 0))
-    found, expected = forces(sine), forces(exact)
+    computed, expected = forces(sine), forces(exact)
     assert np.abs(expected).max() > 1e-3 * E
-    assert np.abs(found - expected).max() <= 1e-12 * np.abs(expected).max()
+    assert np.abs(computed - expected).max() <= 1e-12 * np.abs(expected).max()
 
 
 def test_round_off_forces_after_unloading_are_accepted():
@@ -183,7 +187,7 @@ def test_round_off_forces_supply_no_energy(kinematics, E):
         assert np.abs(contact.resultants().force).max() < 1e-12 * E
 
 
-@pytest.mark.parametrize("options", WAYS, ids=["condensed", "lbfgs", "newton"])
+@pytest.mark.parametrize("options", SOLVER_OPTIONS, ids=["condensed", "lbfgs", "newton"])
 def test_a_load_is_removed_after_a_restart(options):
     """The top of a block above the floor is moved back: u is zero, to 40 eps of the motion.
 

@@ -25,14 +25,14 @@ def distance(x, tip, axis):
     arc = RADIUS * np.column_stack([np.sin(t), 1 - np.cos(t)])
     along = np.linspace(0, 5, 50_001)[1:, None]
     curve = np.vstack([arc, arc[-1] + along * [np.sin(ANGLE), np.cos(ANGLE)]])
-    found, foot = np.empty(len(x)), np.empty((len(x), 2))
+    computed, foot = np.empty(len(x)), np.empty((len(x), 2))
     for i, point in enumerate(np.column_stack([rho, z])):
         nearest = np.argmin(np.linalg.norm(curve - point, axis=1))
         foot[i] = curve[nearest]
-        found[i] = np.linalg.norm(point - foot[i])
+        computed[i] = np.linalg.norm(point - foot[i])
     # Points above the curve z(ρ) are inside.
     inside = z > np.interp(rho, curve[:, 0], curve[:, 1])
-    return np.where(inside, -found, found)
+    return np.where(inside, -computed, computed)
 
 
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
@@ -57,7 +57,7 @@ def test_gap_and_normal_are_those_of_the_generating_curve(cell):
     assert np.ptp(np.arccos(np.clip(-normal @ axis / np.linalg.norm(axis), -1, 1))) > 0.3
 
 
-def pressed(obstacle, cell, **options):
+def drag_forces(obstacle, cell, **options):
     """Return the forces on a block pressed onto an obstacle and dragged in small increments."""
     # By default there are more points if the radius is smaller.
     scene = block(cell, n=4, surface={"quadrature_degree": 4})
@@ -84,8 +84,8 @@ def test_contact_at_the_tip_has_the_forces_of_a_ball(cell):
     """
     up = np.eye(dimension(cell))[-1]
     tip, radius = 0.45 * (1 - up), 8.0
-    cone = pressed(fc.RoundedCone(tip, -up, np.deg2rad(70), radius), cell)
-    ball = pressed(fc.Ball(tip - radius * up, radius), cell)
+    cone = drag_forces(fc.RoundedCone(tip, -up, np.deg2rad(70), radius), cell)
+    ball = drag_forces(fc.Ball(tip - radius * up, radius), cell)
     assert np.abs(ball).max() > 1.0 and is_close(cone, ball, 1e-7)
 
 
@@ -96,8 +96,10 @@ def test_contact_at_the_flank_has_the_forces_of_a_half_space():
     axis, radius = np.array([0.0, -1.0]), 0.1
     # The corner (1, 0) of the block touches the flank at a distance of 2 from the tip's circle.
     centre = np.array([1.0, 0.0]) - radius * n - 2.0 * np.array([-n[1], n[0]])
-    wedge = pressed(fc.RoundedCone(centre - radius * axis, axis, angle, radius), "quadrilateral")
-    plane = pressed(fc.HalfSpace((1.0, 0.0), n), "quadrilateral")
+    wedge = drag_forces(
+        fc.RoundedCone(centre - radius * axis, axis, angle, radius), "quadrilateral"
+    )
+    plane = drag_forces(fc.HalfSpace((1.0, 0.0), n), "quadrilateral")
     assert np.abs(plane).max() > 1.0 and is_close(wedge, plane, 1e-7)
 
 
@@ -109,18 +111,18 @@ def test_wedge_has_the_force_of_a_fine_profile():
     flank = arc[-1] + np.linspace(0, 2, 400)[1:, None] * [np.sin(angle), -np.cos(angle)]
     half = np.vstack([arc, flank])
     profile = tip + np.vstack([half[::-1], half[1:] * [-1, 1]])
-    found = [
-        pressed(obstacle, "quadrilateral")[0]
+    computed = [
+        drag_forces(obstacle, "quadrilateral")[0]
         for obstacle in (fc.RoundedCone(tip, axis, angle, radius), fc.RigidProfile(profile))
     ]
-    assert found[0][1] > 1.0 and abs(found[0][0]) < 1e-9 * found[0][1]
-    assert is_close(found[0], found[1], 1e-4)
+    assert computed[0][1] > 1.0 and abs(computed[0][0]) < 1e-9 * computed[0][1]
+    assert is_close(computed[0], computed[1], 1e-4)
 
 
 def test_invalid_arguments_are_refused():
     """Errors for invalid half angles, radii, axes and tips state the name of the argument."""
     scene = block()
-    given = {"tip": (0.5, -0.1), "axis": (0, -1), "half_angle": ANGLE, "radius": RADIUS}
+    arguments = {"tip": (0.5, -0.1), "axis": (0, -1), "half_angle": ANGLE, "radius": RADIUS}
     for name, value in (
         ("half_angle", 0.0),
         ("half_angle", 60.0),
@@ -130,7 +132,7 @@ def test_invalid_arguments_are_refused():
         ("axis", (0.0, 0.0, 1.0)),
         ("tip", (0.5, np.nan)),
     ):
-        obstacle = fc.RoundedCone(**given | {name: value})
+        obstacle = fc.RoundedCone(**arguments | {name: value})
         assert_raised_on_all_ranks(
             lambda obstacle=obstacle: scene.contact(fc.Frictionless(), obstacle=obstacle),
             ValueError,

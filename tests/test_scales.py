@@ -22,7 +22,7 @@ FLOOR, ROOF, FLOOR_2, ROOF_2 = 1, 2, 3, 4
 pytestmark = pytest.mark.two_ranks
 
 
-def may_take_long(*, refused: bool) -> None:
+def skip_if_slow(*, refused: bool) -> None:
     """Skip on several ranks: a refusal by the uncondensed system takes thousands of iterations."""
     if refused and COMM.size > 1:
         pytest.skip("takes minutes on several ranks")
@@ -41,16 +41,16 @@ def repress(level, small, *, accuracy=None, cell="triangle", **options):
     E = 100 * level
     scene = block(cell, n=4, E=E)
     problem, contact = scene.problem(fc.Coulomb(0.3), [], contact={"accuracy": accuracy}, **options)
-    found = []
+    computed = []
     for up, side in ((-level, 0.0), (0.0, 0.0), (-small, 0.0), (-small, 0.2 * small)):
         scene.load(up=up, side=side)
         problem.solve()
         problem.commit()
         force = contact.resultants().force
-        found.append(np.array([force[0], force[-1]]))
+        computed.append(np.array([force[0], force[-1]]))
         if up == 0.0:
             left = COMM.allreduce(np.abs(scene.u.x.array).max(initial=0.0), MPI.MAX)
-    return found, np.finfo(float).eps * E * left
+    return computed, np.finfo(float).eps * E * left
 
 
 @pytest.mark.each
@@ -62,7 +62,7 @@ def test_small_load_after_a_large_one(level, accuracy):
     A load 1e11 times smaller, near the round-off of the earlier one, may be refused. Otherwise its
     forces are correct to the tolerance and ten times the round-off of the body's position.
     """
-    may_take_long(refused=level >= 1e7)
+    skip_if_slow(refused=level >= 1e7)
     small = 1e-4
     try:
         (pressed, _, touched, sheared), rounded = repress(level, small, accuracy=accuracy)
@@ -86,7 +86,7 @@ def test_small_load_after_a_large_one_with_every_method(method, condensation):
 @pytest.mark.parametrize("drop", [1e-3, 1e-8, 1e-12])
 def test_load_reduced_in_one_increment(drop):
     """The load is not released in between; at the round-off of the increment it may be refused."""
-    may_take_long(refused=drop == 1e-12)
+    skip_if_slow(refused=drop == 1e-12)
     scene = block("quadrilateral", n=4)
     problem, contact = scene.problem(fc.Coulomb(0.3), [])
     for up in (-1.0, -drop):
@@ -135,16 +135,16 @@ def press_two_boxes(ratio, *, one_contact=False, joined=False, friction=0.5, **o
         shear.value = side
         step = problem.solve()
         problem.commit()
-    found = []
+    computed = []
     for low, high in ((-1, 1.5), (1.5, 4)):
         force = np.zeros(2)
         for contact in contacts:
             rows = point_values(contact, np.hstack([contact.points, contact.traction]))
             measure = point_values(contact, contact.measure[:, None])
-            mine = (rows[:, 0] > low) & (rows[:, 0] < high)
-            force += measure[mine, 0] @ rows[mine, 2:]
-        found.append(force)
-    return loads, found, step
+            of_box = (rows[:, 0] > low) & (rows[:, 0] < high)
+            force += measure[of_box, 0] @ rows[of_box, 2:]
+        computed.append(force)
+    return loads, computed, step
 
 
 @pytest.mark.each
@@ -153,8 +153,8 @@ def press_two_boxes(ratio, *, one_contact=False, joined=False, friction=0.5, **o
 @pytest.mark.parametrize("ratio", [1e3, 1e4, 1e8])
 def test_lightly_loaded_body_next_to_a_heavily_loaded_one(ratio, method, one_contact):
     """The contact force on every body is its own load, to 1e-8 of this load."""
-    loads, found, step = press_two_boxes(ratio, method=method, one_contact=one_contact)
-    for load, force in zip(loads, found, strict=True):
+    loads, computed, step = press_two_boxes(ratio, method=method, one_contact=one_contact)
+    for load, force in zip(loads, computed, strict=True):
         assert np.abs(force - [-0.2 * load, load]).max() <= 1e-8 * load
     assert set(step.verdict.equations) >= {"body 1", "body 2"}
     assert set(step.verdict.sums) == {"body 1", "body 2"}
@@ -167,8 +167,8 @@ def test_unbalanced_body_is_named():
     verdict = step.verdict
     light = verdict.equations["body 2"]  # bodies are numbered along x
     assert light.force < 1e-6
-    broken = fc.ForceBalance(1e-3 * light.force, light.force, light.tolerance)
-    equations = verdict.equations | {"body 2": broken}
+    unbalanced = fc.ForceBalance(1e-3 * light.force, light.force, light.tolerance)
+    equations = verdict.equations | {"body 2": unbalanced}
     failures = fc.Verdict(equations, verdict.sums, verdict.laws).failures
     assert len(failures) == 1 and "body 2" in failures[0]
 
@@ -187,9 +187,9 @@ def test_tolerance_of_a_soft_body_next_to_a_stiff_one(condensation):
         FLOOR_2: lambda x, c: (np.abs(x[:, 1]) < 1e-9) & (c[:, 0] > 1.5),
         ROOF: lambda x, c: np.abs(x[:, 1] - 1) < 1e-9,
     }
-    made = boxes([[lines, lines], [lines + 2, lines]], sides)
-    E = ufl.conditional(ufl.lt(ufl.SpatialCoordinate(made[0])[0], 1.5), 1e8, 1.0)
-    body = Bodies(made, E, 0.3)
+    mesh_and_tags = boxes([[lines, lines], [lines + 2, lines]], sides)
+    E = ufl.conditional(ufl.lt(ufl.SpatialCoordinate(mesh_and_tags[0])[0], 1.5), 1e8, 1.0)
+    body = Bodies(mesh_and_tags, E, 0.3)
     body.prescribe(ROOF, 0)
     body.prescribe(ROOF, 1, value=-1e-3)
     floor = fc.HalfSpace((0, 0), (0, 1))
@@ -212,10 +212,10 @@ def test_residuals_that_are_not_finite_fail(place, value):
     """Even an infinite residual below an infinite tolerance fails."""
     numbers = {"residual": np.inf if value == np.inf else 0.0, "force": 1.0, "tolerance": np.inf}
     numbers[place] = value
-    broken = fc.ForceBalance(**numbers)
+    unbalanced = fc.ForceBalance(**numbers)
     sound = fc.ForceBalance(0.0, 1.0, 1e-9)
-    assert fc.Verdict({"the body": broken}, {"the body": sound}).failures
-    assert fc.Verdict({"the body": sound}, {"the body": broken}).failures
+    assert fc.Verdict({"the body": unbalanced}, {"the body": sound}).failures
+    assert fc.Verdict({"the body": sound}, {"the body": unbalanced}).failures
     assert not fc.Verdict({"the body": sound}, {"the body": sound}).failures
 
 

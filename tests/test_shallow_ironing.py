@@ -75,9 +75,9 @@ def test_demo_has_the_published_range() -> None:
 def test_runs_are_reproduced(name: str) -> None:
     """Forces are reproduced to 1e-6, with residuals of 1e-9."""
     (row,) = (row for row in study.read_rows(study.STUDY) if row["name"] == name)
-    found, _ = study.run(study.settings()[name])
-    if found["dofs"] != int(row["dofs"]):
+    computed, _ = study.run(study.settings()[name])
+    if computed["dofs"] != int(row["dofs"]):
         pytest.skip("another gmsh makes another mesh")
     for quantity in study.QUANTITIES:
         if row[quantity]:
-            assert found[quantity] == pytest.approx(float(row[quantity]), rel=1e-6)
+            assert computed[quantity] == pytest.approx(float(row[quantity]), rel=1e-6)

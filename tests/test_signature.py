@@ -19,7 +19,7 @@ COMM = MPI.COMM_WORLD
 pytestmark = [pytest.mark.two_ranks, pytest.mark.newest]
 
 
-def made(power=1.0, factor=1.0):
+def make_rubber_law(power=1.0, factor=1.0):
     """Return a law class with this friction bound; name and parameters are always the same."""
 
     @dataclass(frozen=True)
@@ -75,7 +75,11 @@ def test_signature_is_the_same_in_every_process_and_release():
 def test_signatures_of_laws_depend_on_their_code_only():
     """They depend on bound, polygon, dimension and multipliers, not on parameter values."""
     laws = [fc.Coulomb(0.3), fc.Coulomb(0.3, modes=4), fc.Coulomb(0.3, modes=5)]
-    laws += [made()(0.3), made(power=0.9)(0.3), made(factor=1.01)(0.3)]
+    laws += [
+        make_rubber_law()(0.3),
+        make_rubber_law(power=0.9)(0.3),
+        make_rubber_law(factor=1.01)(0.3),
+    ]
     laws += [fc.Tresca(0.3, 1.0), fc.Tresca(0.3, 1.0, unilateral=False)]
     laws += [fc.Foundation(1.0, 1.0), fc.Foundation(1.0, 1.0, tension=False), fc.Frictionless()]
     words = [signature_of_law(law, 3, multipliers=False) for law in laws]
@@ -91,19 +95,19 @@ def test_signature_of_a_deeply_nested_expression():
     """An obstacle of 3000 nested terms does not exceed Python's recursion limit."""
 
     def distance(x):
-        found = x[0]
+        expression = x[0]
         for k in range(1, 3000):
-            found = ufl.min_value(found, x[1] + k)
-        return found
+            expression = ufl.min_value(expression, x[1] + k)
+        return expression
 
     assert len(signature_of_obstacle(fc.SignedDistance(distance), 2)) == 16
 
 
-@pytest.mark.parametrize("other", [made(power=0.99), made(factor=1.001)])
+@pytest.mark.parametrize("other", [make_rubber_law(power=0.99), make_rubber_law(factor=1.001)])
 def test_checkpoint_of_a_law_with_other_code_is_refused(other, tmp_path):
     """A law of the same name and parameters but other code is refused; the same code continues."""
     path, options = shared_folder(tmp_path) / "state.npz", {"friction": 0.3, "k_n": 2e4, "k_t": 1e4}
-    first = BlockOnBallHistory(made()(**options))
+    first = BlockOnBallHistory(make_rubber_law()(**options))
     for step in first.increments(checkpoint=path):
         if step.increment == 2:
             break
@@ -111,9 +115,12 @@ def test_checkpoint_of_a_law_with_other_code_is_refused(other, tmp_path):
     assert_raised_on_all_ranks(
         lambda: next(changed.increments(checkpoint=path)), ValueError, "code (UFL) of the law of"
     )
-    assert next(BlockOnBallHistory(made()(**options)).increments(checkpoint=path)).increment == 3
-    told = BlockOnBallHistory(other(**options))
-    assert next(told.increments(checkpoint=path, on_mismatch="continue")).increment == 4
+    assert (
+        next(BlockOnBallHistory(make_rubber_law()(**options)).increments(checkpoint=path)).increment
+        == 3
+    )
+    expected = BlockOnBallHistory(other(**options))
+    assert next(expected.increments(checkpoint=path, on_mismatch="continue")).increment == 4
 
 
 def test_checkpoint_of_an_obstacle_that_differs_off_contact_is_refused(tmp_path):

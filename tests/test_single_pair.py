@@ -62,7 +62,7 @@ def test_self_contact_of_a_slit_ring_equals_its_half_on_a_plane(degree):
     Both have half the jump as penetration; forces agree to 1e-7, pressures to 1e-6. By symmetry the
     faces do not shear, so that friction, which only the ring has, carries no force.
     """
-    k_n, made, first = 1e7, [], []
+    k_n, contacts, first = 1e7, [], []
     for half in (False, True):
         body = slit_ring(half=half, degree=degree)
         squeeze = body.constant(0.0)
@@ -75,9 +75,9 @@ def test_self_contact_of_a_slit_ring_equals_its_half_on_a_plane(degree):
         problem = body.problem(contact)
         few, *_ = list(fc.increments(problem, squeeze, 0.0, 1e3, steps=[200.0, 1e3]))
         assert few.contacts["contact"].open > 0, "first, only a part of the lips shall touch"
-        made.append(contact)
+        contacts.append(contact)
         first.append(few.contacts["contact"].force)
-    ring, half = made
+    ring, half = contacts
     assert is_close(*first, 1e-7) and first[0][1] > 100.0
     assert is_close(ring.gather()["pressure"], half.gather()["pressure"], 1e-6)
     assert is_close(ring.resultants().force, half.resultants().force, 1e-7)

@@ -52,12 +52,12 @@ def test_cantilever_sags_onto_a_plane(law):
     def load(t):
         weight.value = 0.1 * t
 
-    made = []
+    iterations = []
     for step in fc.increments(problem, load, steps=10, max_cuts=0):
         assert [attempt.method for attempt in step.attempts] == ["newton"]
-        made.append(step.iterations)
-    assert max(made[2:]) <= 6, made
-    assert sum(made) <= (66 if law.has_friction else 53), made
+        iterations.append(step.iterations)
+    assert max(iterations[2:]) <= 6, iterations
+    assert sum(iterations) <= (66 if law.has_friction else 53), iterations
     bending = E / (1 - NU**2) * HEIGHT**3 / 12
     tip = 3 * 0.1 * LENGTH / 8 - 3 * bending * CLEARANCE / LENGTH**3
     most = 3 * CLEARANCE / (2 * LENGTH) * contact.resultants().tangential_force

@@ -34,14 +34,14 @@ def test_pairs_follow_a_displaced_body(cell, update):
     a, b = carried.contact.gather(), standing.contact.gather()
     assert is_close(a["pressure"], b["pressure"], 1e-7)
     # Without the update the pairs are those of the start: this is refused, or causes a warning.
-    held = SlidingBlock(cell, law, start=0.4, n=n, update_pairs="never")
-    held.step(-0.01, 1.33)
+    initial_pairs = SlidingBlock(cell, law, start=0.4, n=n, update_pairs="never")
+    initial_pairs.step(-0.01, 1.33)
     with pytest.raises(fc.NotConverged, match="small-displacement"):
-        held.step(0.002, 1.33)
-    held.problem.small_displacement_tolerance = np.inf
+        initial_pairs.step(0.002, 1.33)
+    initial_pairs.problem.small_displacement_tolerance = np.inf
     with pytest.warns(UserWarning, match="assumed small"):
-        held.step(0.002, 1.33)
-    assert not is_close(held.contact.gather()["pressure"], b["pressure"], 1e-3)
+        initial_pairs.step(0.002, 1.33)
+    assert not is_close(initial_pairs.contact.gather()["pressure"], b["pressure"], 1e-3)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -51,11 +51,11 @@ def test_steady_sliding_has_the_tangential_force_of_the_law(cell, method):
 
     Far from the ends of the base N changes only by its facets: 1 %.
     """
-    made = SlidingBlock(cell, fc.Coulomb(0.3, k_n=K_N, k_t=K_N), start=0.8, method=method)
-    made.step(0.002, 0.0)
+    setup = SlidingBlock(cell, fc.Coulomb(0.3, k_n=K_N, k_t=K_N), start=0.8, method=method)
+    setup.step(0.002, 0.0)
     normal = []
     for along in np.linspace(0.1, 1.5, 15):
-        step = made.step(0.002, along)
+        step = setup.step(0.002, along)
         r = step.contacts["contact"]
         assert r.stick == 0
         assert is_close(r.tangential_force, 0.3 * r.normal_force, 1e-9)
@@ -69,27 +69,27 @@ def test_steady_sliding_has_the_tangential_force_of_the_law(cell, method):
 
 def test_sticking_points_keep_their_traction_when_pairs_are_updated():
     """Sticking points keep their traction when their pairs are updated: there is no creep."""
-    made = SlidingBlock("quadrilateral", fc.Coulomb(5.0, k_n=K_N, k_t=K_N), start=1.1)
-    made.step(0.002, 0.0)
-    made.step(0.002, 1e-4)
-    before = owned_values(made.u).copy()
-    shear = made.contact.resultants().force[0]
+    setup = SlidingBlock("quadrilateral", fc.Coulomb(5.0, k_n=K_N, k_t=K_N), start=1.1)
+    setup.step(0.002, 0.0)
+    setup.step(0.002, 1e-4)
+    before = owned_values(setup.u).copy()
+    shear = setup.contact.resultants().force[0]
     for _ in range(3):
-        made.step(0.002, 1e-4)
-    assert is_close(gather(COMM, owned_values(made.u)), gather(COMM, before), 1e-3)
-    assert is_close(made.contact.resultants().force[0], shear, 1e-2)
-    assert made.contact.resultants().stick > 0
+        setup.step(0.002, 1e-4)
+    assert is_close(gather(COMM, owned_values(setup.u)), gather(COMM, before), 1e-3)
+    assert is_close(setup.contact.resultants().force[0], shear, 1e-2)
+    assert setup.contact.resultants().stick > 0
 
 
 def test_points_beyond_the_edge_are_open_and_counted():
     """Points displaced beyond the end of the base have no opposite point any more."""
-    made = SlidingBlock("quadrilateral", fc.Frictionless(k_n=K_N), start=2.7)
-    made.step(0.002, 0.0)
-    assert made.contact.n_unpaired == 0
+    setup = SlidingBlock("quadrilateral", fc.Frictionless(k_n=K_N), start=2.7)
+    setup.step(0.002, 0.0)
+    assert setup.contact.n_unpaired == 0
     for along in (0.3, 0.6):
-        made.step(0.002, along)
-    assert made.contact.n_unpaired > 0
-    assert made.contact.resultants().normal_force > 0
+        setup.step(0.002, along)
+    assert setup.contact.n_unpaired > 0
+    assert setup.contact.resultants().normal_force > 0
 
 
 @pytest.mark.parametrize("condensation", [None, False])
@@ -102,7 +102,7 @@ def test_default_updates_pairs_after_slip_by_a_facet(condensation):
     """
     law = fc.Coulomb(0.3, k_n=K_N, k_t=K_N)
     slides = [0.0, 0.2, 0.3, 0.4, 0.5]
-    made = {
+    blocks_by_option = {
         update: SlidingBlock(
             "quadrilateral",
             law,
@@ -114,7 +114,7 @@ def test_default_updates_pairs_after_slip_by_a_facet(condensation):
         for update in ("never", "auto", "increment")
     }
     numbers, forces = {}, {}
-    for update, slider in made.items():
+    for update, slider in blocks_by_option.items():
         slider.problem.small_displacement_tolerance = np.inf
         first = slider.contact.pairs.n_updates
         numbers[update], forces[update] = [], []
@@ -123,7 +123,7 @@ def test_default_updates_pairs_after_slip_by_a_facet(condensation):
             numbers[update].append(slider.contact.pairs.n_updates - first)
             forces[update].append(step.contacts["contact"].force)
     assert numbers == {"never": [0] * 5, "auto": [0, 0, 1, 2, 3], "increment": [1, 2, 3, 4, 5]}
-    never, auto, increment = (np.array(forces[update]) for update in made)
+    never, auto, increment = (np.array(forces[update]) for update in blocks_by_option)
     assert is_close(auto[:3], never[:3], 1e-12)
     assert is_close(auto[3:], increment[3:], 1e-3)
 
@@ -133,14 +133,16 @@ def test_pair_update_recovers_the_interior_displacement():
     law = fc.Coulomb(0.3, k_n=K_N, k_t=K_N)
     forces = []
     for field in (True, False):
-        made = SlidingBlock("quadrilateral", law, start=0.8, update_pairs="auto", condensation=True)
+        setup = SlidingBlock(
+            "quadrilateral", law, start=0.8, update_pairs="auto", condensation=True
+        )
         steps = []
         for displacement in [0.0, 0.2, 0.3, 0.4]:
-            made.top_displacement[-1].value, made.top_displacement[0].value = -0.002, displacement
-            steps.append(made.problem.solve(recover_interior=field))
-            made.problem.commit()
+            setup.top_displacement[-1].value, setup.top_displacement[0].value = -0.002, displacement
+            steps.append(setup.problem.solve(recover_interior=field))
+            setup.problem.commit()
         assert [step.complete for step in steps] == [True] * 4 if field else [False] * 3 + [True]
-        assert made.contact.pairs.n_updates > 1
+        assert setup.contact.pairs.n_updates > 1
         forces.append([step.contacts["contact"].force for step in steps])
     assert is_close(np.array(forces[1]), np.array(forces[0]), 1e-9)
 

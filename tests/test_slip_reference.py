@@ -29,7 +29,7 @@ class Pin:
         load: Traction in the bore, downward, or vertical displacement of the bore or the hole.
     """
 
-    def __init__(self, loading, bulk="linear", *, apart=True, **options):
+    def __init__(self, loading, bulk="linear", *, has_clearance=True, **options):
         """Create the pin in the middle of the hole, or where it touches the hole below."""
         axes = [[np.linspace(4.0, RADIUS, 5), np.linspace(0.0, 1.0, 33)]]
 
@@ -53,18 +53,18 @@ class Pin:
         else:
             bodies.prescribe(BORE, 1)
             hole = ufl.as_vector([0.0, self.load])
-        middle = (0.0, 0.0 if apart else CLEARANCE)
+        middle = (0.0, 0.0 if has_clearance else CLEARANCE)
         around = fc.Cylinder(middle, RADIUS + CLEARANCE, inside=True, displacement=hole)
         self.contact = bodies.contact(SURFACE, around, LAW, **options)
         self.problem = bodies.problem(self.contact)
 
     def results(self, start, end, steps):
         """Return normal and tangential force, largest pressure, and frictional dissipation."""
-        took = 0.0
+        dissipation = 0.0
         for step in fc.increments(self.problem, self.load, start, end, steps=steps, max_cuts=0):
-            took += step.energy.dissipation
+            dissipation += step.energy.dissipation
         r = self.contact.resultants()
-        return np.array([r.normal_force, r.tangential_force, r.max_pressure, took])
+        return np.array([r.normal_force, r.tangential_force, r.max_pressure, dissipation])
 
 
 @pytest.mark.each
@@ -85,9 +85,9 @@ def test_initial_clearance_does_not_change_the_solution(loading, kinematics, enf
     down = {"load": 1000.0, "bore": -0.05, "hole": 0.05}[loading]
     flight = 0.0 if loading == "load" else down
     for steps in (1, 4):
-        apart = Pin(loading, **options).results(0.0, flight + down, steps * (1 + (flight != 0)))
-        touching = Pin(loading, apart=False, **options).results(0.0, down, steps)
-        assert np.all(np.abs(apart - touching) <= tolerance * np.abs(touching))
+        separated = Pin(loading, **options).results(0.0, flight + down, steps * (1 + (flight != 0)))
+        touching = Pin(loading, has_clearance=False, **options).results(0.0, down, steps)
+        assert np.all(np.abs(separated - touching) <= tolerance * np.abs(touching))
         if flight:  # approach and contact in one increment
             at_once = Pin(loading, **options).results(0.0, flight + down, 1)
             if steps == 1:
@@ -102,9 +102,9 @@ def test_rubber_pin_moves_into_contact_in_one_increment(loading):
     """
     down = {"bore": -0.05, "hole": 0.05}[loading]
     options = {"bulk": "rubber", "kinematics": "finite"}
-    apart = Pin(loading, **options).results(0.0, 2 * down, 1)
-    touching = Pin(loading, apart=False, **options).results(0.0, down, 1)
-    assert np.all(np.abs(apart - touching) <= 0.01 * np.abs(touching))
+    separated = Pin(loading, **options).results(0.0, 2 * down, 1)
+    touching = Pin(loading, has_clearance=False, **options).results(0.0, down, 1)
+    assert np.all(np.abs(separated - touching) <= 0.01 * np.abs(touching))
 
 
 class Blocks:
@@ -113,7 +113,7 @@ class Blocks:
     def __init__(self, gap, opposite, *, along=True, **options):
         """Create the blocks."""
         lines = np.linspace(0.0, 1.0, 5)
-        under = [np.linspace(-0.5, 1.5, 9), np.linspace(-1.0 - gap, -gap, 5)]
+        axes_below = [np.linspace(-0.5, 1.5, 9), np.linspace(-1.0 - gap, -gap, 5)]
         sides = {
             1: at_interface(1, -gap / 2, above=True),
             2: at_coordinate(1, 1.0),
@@ -123,7 +123,7 @@ class Blocks:
         # The sides of the boxes have no tag.
         for tag, height in ((1, 0.0), (3, -gap)):
             sides[tag] = at_coordinate(1, height)
-        parts = [[lines, lines], under] if opposite == "body" else [[lines, lines]]
+        parts = [[lines, lines], axes_below] if opposite == "body" else [[lines, lines]]
         if opposite != "body":
             sides = {tag: sides[tag] for tag in (1, 2)}
         self.bodies = bodies = Bodies(boxes(parts, sides), 1000.0, 0.3)
@@ -141,7 +141,7 @@ class Blocks:
         self.contact = bodies.contact(1, obstacle, fc.Coulomb(friction=0.3), **options)
         self.problem = bodies.problem(self.contact)
 
-    def go(self, along, up):
+    def solve_increment(self, along, up):
         """Displace the upper block, solve and commit; return dissipation and contact forces."""
         for constant, value in zip(self.prescribed, (along, up), strict=True):
             constant.value = value
@@ -162,12 +162,12 @@ def test_tangential_motion_before_contact_is_not_slip(opposite, kinematics):
     """
     gap, down, along = 0.09, 0.1, 0.003
     touch = gap / down
-    found = []
+    computed = []
     for path in ([(along, -down)], [(touch * along, -gap), (along, -down)]):
         scene = Blocks(gap, opposite, kinematics=kinematics)
-        found.append([scene.go(*way) for way in path][-1])
-    assert is_close(found[0], found[1], 1e-5)
-    assert found[0][3] < 0.25 * found[0][2]  # friction is below its bound
+        computed.append([scene.solve_increment(*displacement) for displacement in path][-1])
+    assert is_close(computed[0], computed[1], 1e-5)
+    assert computed[0][3] < 0.25 * computed[0][2]  # friction is below its bound
 
 
 def test_uncommitted_solution_does_not_change_the_history():
@@ -192,7 +192,7 @@ def test_first_touch_is_determined_per_contact():
     Reference: each block alone; the slip agrees to 1e-9 of the tangential displacement.
     """
 
-    def slips(gaps):
+    def slip_of_bodies(gaps):
         lines = np.linspace(0.0, 1.0, 3)
         sides, parts = {}, []
         for n, gap in enumerate(gaps):
@@ -219,7 +219,7 @@ def test_first_touch_is_determined_per_contact():
             for c in contacts
         ]
 
-    both = slips([0.03, 0.09])
+    both = slip_of_bodies([0.03, 0.09])
     for n, gap in enumerate((0.03, 0.09)):
-        assert np.abs(both[n] - slips([gap])[0]).max() < 1e-9 * 0.01
+        assert np.abs(both[n] - slip_of_bodies([gap])[0]).max() < 1e-9 * 0.01
         assert both[n].max() < 0.011 * (1 - gap / 0.1)

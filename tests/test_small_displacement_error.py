@@ -25,7 +25,7 @@ RADIUS, DEPTH = 4.0, 0.05
 pytestmark = pytest.mark.two_ranks
 
 
-def pressed(
+def dragged_block(
     cell="quadrilateral", *, body=0.0, obstacle=0.0, small_displacement_tolerance=np.inf, **options
 ):
     """Return a block pressed on a cylinder or ball by Dirichlet values, one of them dragged."""
@@ -50,7 +50,7 @@ def pressed(
 
 
 def solved(**scene):
-    problem, contact = pressed(**scene)
+    problem, contact = dragged_block(**scene)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         step = problem.solve()
@@ -85,7 +85,7 @@ def test_plane_has_no_small_displacement_error():
 def test_gap_and_normal_at_the_deformed_position(cell):
     """`true_placement` gives distance and direction to the ball at X + u, to 1e-12."""
     d = 2 if cell == "quadrilateral" else 3
-    problem, contact = pressed(cell, d=d, body=0.3)
+    problem, contact = dragged_block(cell, d=d, body=0.3)
     problem.u.interpolate(lambda x: np.stack([0.1 + 0.05 * x[0] - 0.02 * x[i] for i in range(d)]))
     contact.evaluate()
     gap, normal = contact.true_placement()
@@ -101,7 +101,7 @@ def test_gap_and_normal_at_the_deformed_position(cell):
 
 
 def test_large_displacement_fails():
-    problem, contact = pressed(body=-1.0, small_displacement_tolerance=0.2)
+    problem, contact = dragged_block(body=-1.0, small_displacement_tolerance=0.2)
     with pytest.raises(fc.NotConverged, match="too large for the small-displacement"):
         problem.solve()
     assert is_close(contact.history.rows(), 0 * contact.history.rows(), 0.0, scale=1.0)
@@ -128,7 +128,7 @@ def test_deformation_by_a_stiffness_in_wrong_units_fails(condensation):
 
 def test_small_displacement_warning_is_repeated_at_each_doubling():
     """The warning is repeated when the error has doubled; every summary above 1 % states it."""
-    problem, _ = pressed(body=-0.2, small_displacement_tolerance=0.5)
+    problem, _ = dragged_block(body=-0.2, small_displacement_tolerance=0.5)
     with pytest.warns(UserWarning, match="assumed small") as caught:
         step = problem.solve()
     problem.commit()
@@ -139,23 +139,23 @@ def test_small_displacement_warning_is_repeated_at_each_doubling():
         warnings.simplefilter("error")
         problem.solve()
     first = step.verdict.small_displacement_error["contact"].worst
-    moved, said, shares = fem.Constant(problem.u.function_space.mesh, 0.0), [], []
-    problem, _ = pressed(body=moved, small_displacement_tolerance=np.inf)
+    moved, dragged, ratios = fem.Constant(problem.u.function_space.mesh, 0.0), [], []
+    problem, _ = dragged_block(body=moved, small_displacement_tolerance=np.inf)
     for displacement in np.linspace(0.0, -0.4, 9):
         moved.value = displacement
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             step = problem.solve()
         problem.commit()
-        said.append(any("assumed small" in str(w.message) for w in caught))
-        shares.append(step.verdict.small_displacement_error["contact"].worst)
-        assert ("assumed small" in step.summary()) == (shares[-1] > 0.01)
+        dragged.append(any("assumed small" in str(w.message) for w in caught))
+        ratios.append(step.verdict.small_displacement_error["contact"].worst)
+        assert ("assumed small" in step.summary()) == (ratios[-1] > 0.01)
     warned = [
-        share for share, with_dragged_body in zip(shares, said, strict=True) if with_dragged_body
+        ratio for ratio, with_dragged_body in zip(ratios, dragged, strict=True) if with_dragged_body
     ]
     assert len(warned) > 2 and warned[-1] > first
     assert all(b > 2 * a for a, b in pairwise(warned))
-    assert max(shares) <= 2 * warned[-1]
+    assert max(ratios) <= 2 * warned[-1]
 
 
 # ---- rotated scene -------------------------------------------------------------------------------
@@ -167,7 +167,7 @@ def test_estimates_are_invariant_under_rotation(angle):
 
     The largest component instead of the norm would give a force error smaller by up to √2.
     """
-    found = []
+    computed = []
     for turn in (0.0, np.deg2rad(angle)):
         c, s = np.cos(turn), np.sin(turn)
         q = np.array([[c, -s], [s, c]])
@@ -196,16 +196,16 @@ def test_estimates_are_invariant_under_rotation(angle):
             step = problem.solve()
         with_dragged_body = step.verdict.small_displacement_error["contact"]
         budget = fc.estimate_errors(problem, stress(scene.u, scene.E, scene.nu))
-        found.append([with_dragged_body.force, with_dragged_body.pressure])
-        found[-1] += [budget.values["displacement"], budget.parts["kinematics"]["displacement"]]
-    assert min(found[0][:2]) > 0.01
-    assert found[1] == pytest.approx(found[0], rel=1e-5)
+        computed.append([with_dragged_body.force, with_dragged_body.pressure])
+        computed[-1] += [budget.values["displacement"], budget.parts["kinematics"]["displacement"]]
+    assert min(computed[0][:2]) > 0.01
+    assert computed[1] == pytest.approx(computed[0], rel=1e-5)
 
 
 # ---- an obstacle whose displacement varies along Γc ----------------------------------------------
 
 
-def tilted(angle, formulation):
+def error_with_tilted_floor(angle, formulation):
     """Return error and force of a block fixed at its top and a floor tilted by a displacement."""
     scene = block("quadrilateral", n=8)
     x = ufl.SpatialCoordinate(scene.mesh)
@@ -241,19 +241,19 @@ def test_error_of_a_plane_tilted_by_its_displacement(formulation):
     It agrees within the larger of e/10 and e², at most 2 e²: second-order terms are neglected.
     """
     for angle in (0.03, 0.1):
-        with_dragged_body, force = tilted(angle, formulation)
-        exact, reference = tilted(angle, "plane")
+        with_dragged_body, force = error_with_tilted_floor(angle, formulation)
+        exact, reference = error_with_tilted_floor(angle, "plane")
         assert exact.worst == 0.0
         missing = np.linalg.norm(force - reference) / np.linalg.norm(force)
         assert with_dragged_body.force == pytest.approx(
             missing, abs=min(max(0.1 * missing, missing**2), 2 * missing**2)
         )
-    with_dragged_body, _ = tilted(0.0, formulation)
+    with_dragged_body, _ = error_with_tilted_floor(0.0, formulation)
     assert with_dragged_body.worst <= 1e-3
 
 
 def test_small_displacement_gives_no_warning():
-    problem, _ = pressed(body=-1e-4)
+    problem, _ = dragged_block(body=-1e-4)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         step = problem.solve()
@@ -276,7 +276,7 @@ def test_error_budget_includes_the_small_displacement_error():
     """The kinematics part of the normal force is the difference to the dragged obstacle, to 1/3."""
 
     def solved(**scene):
-        problem, contact = pressed(**scene)
+        problem, contact = dragged_block(**scene)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             problem.solve()
@@ -306,8 +306,8 @@ def test_estimate_includes_tangential_stiffness_of_slip(transverse, cell, enforc
     options = {"transverse_friction": transverse, "direction": np.eye(d)[0]} if transverse else {}
     law = fc.Coulomb(0.3, 1e4, 1e3, **options)
     bcs = [scene.dirichlet_bc(TOP, i, -0.01 if i == d - 1 else 0.0) for i in range(d)]
-    given = {"displacement": shift, "enforcement": enforcement}
-    problem, contact = scene.problem(law, bcs, contact=given)
+    contact_options = {"displacement": shift, "enforcement": enforcement}
+    problem, contact = scene.problem(law, bcs, contact=contact_options)
     problem.solve()
     problem.commit()
     shift.value[:2] = 0.02, 0.01 * (d - 2)
@@ -315,8 +315,10 @@ def test_estimate_includes_tangential_stiffness_of_slip(transverse, cell, enforc
     slips, normal = contact.status == fc.Status.SLIP, contact.values.normal
     assert scene.mesh.comm.allreduce(int(slips.sum())) > 0
     flat = np.eye(d) - np.einsum("qi,qj->qij", normal, normal)
-    found = flat @ spring_stiffness(contact) @ flat
+    computed = flat @ spring_stiffness(contact) @ flat
     exact = -flat @ contact.effective_law.tangent().by_jump @ flat
     largest = COMM.allreduce(np.abs(exact[slips]).max(initial=0.0), op=MPI.MAX)
     assert (largest > 1.0) == (d == 3)
-    assert COMM.allreduce(np.abs((found - exact)[slips]).max(initial=0.0), op=MPI.MAX) < 1e-9 * 1e3
+    assert (
+        COMM.allreduce(np.abs((computed - exact)[slips]).max(initial=0.0), op=MPI.MAX) < 1e-9 * 1e3
+    )

@@ -10,10 +10,10 @@ from scenes.blocks import LEFT, RIGHT, TOP
 from scenes.unrelated_bodies import Box, SceneWithUnrelatedBodies
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
-RADIUS, SLOPE, WAY = 2.0, 0.5, 0.5
+RADIUS, SLOPE, PRESCRIBED_DISPLACEMENT = 2.0, 0.5, 0.5
 
 
-def pushed(by, loads, *, friction):
+def push_along_cantilever(by, loads, *, friction):
     """Push a disc along x up a rising cantilever; return force, position, iterations, (3, n)."""
 
     def rising(x):
@@ -35,14 +35,14 @@ def pushed(by, loads, *, friction):
     law = fc.Coulomb(friction) if friction else fc.Frictionless()
     contact = scene.contact("arm", TOP, tool, law, kinematics="finite")
     problem = scene.problem(contact)
-    found = []
+    computed = []
     for value in loads:
         load.value = value
         step = problem.solve()
         problem.commit()
         along = contact.motions[0].value if by == "force" else value
-        found.append((contact.resultants().force[0], along, step.iterations))
-    return np.array(found).T
+        computed.append((contact.resultants().force[0], along, step.iterations))
+    return np.array(computed).T
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.2])
@@ -53,16 +53,16 @@ def test_force_and_displacement_control_agree(friction):
     deformation due to a closed point, a thousandth of it: "no progress", however small the
     increments.
     """
-    displacements = np.linspace(0.1, 1.0, 10) * WAY
-    forces, _, _ = pushed("displacement", displacements, friction=friction)
+    displacements = np.linspace(0.1, 1.0, 10) * PRESCRIBED_DISPLACEMENT
+    forces, _, _ = push_along_cantilever("displacement", displacements, friction=friction)
     assert np.all(np.diff(forces) > 0)
-    found, places, iterations = pushed("force", forces, friction=friction)
-    assert np.abs(found - forces).max() <= 1e-8 * forces.max()
-    assert np.abs(places - displacements).max() <= 1e-6 * WAY
+    computed, places, iterations = push_along_cantilever("force", forces, friction=friction)
+    assert np.abs(computed - forces).max() <= 1e-8 * forces.max()
+    assert np.abs(places - displacements).max() <= 1e-6 * PRESCRIBED_DISPLACEMENT
     assert iterations.max() <= 40  # 5 to 13
 
 
-def step_of(gap, force, other_gaps=(), *, along=None):
+def first_newton_displacement(gap, force, other_gaps=(), *, along=None):
     """Return the first Newton displacement of a tool above an arm, by a force along y (length).
 
     ``other_gaps``: gap of a wall next to the arm, which the tool does not move. ``along``: a force
@@ -71,8 +71,8 @@ def step_of(gap, force, other_gaps=(), *, along=None):
     scene = SceneWithUnrelatedBodies({"arm": Box(size=(1.0, 1.0), n=(4, 4))}, E=1e3)
     scene.prescribe("arm", LEFT, 0)
     scene.prescribe("arm", LEFT, 1)
-    held = 0.0 if along is None else None
-    motion = fc.Motion(force=(along, force), displacement=(held, None))
+    prescribed = 0.0 if along is None else None
+    motion = fc.Motion(force=(along, force), displacement=(prescribed, None))
     tool = fc.HalfSpace((0.0, 1.0 + gap), (0, -1), displacement=motion)
     contacts = [scene.contact("arm", TOP, tool, fc.Coulomb(3.0), name="tool")]
     if other_gaps:
@@ -89,35 +89,37 @@ def step_of(gap, force, other_gaps=(), *, along=None):
     change = equations.function.duplicate()
     equations.solvers[True].setOperators(matrix)
     equations.solvers[True].solve(-equations.function, change)
-    here = equations.system.unknowns.motions(change.array_r * equations.length)
-    return float(here[-1])
+    motions = equations.system.unknowns.motions(change.array_r * equations.length)
+    return float(motions[-1])
 
 
 @pytest.mark.parametrize("gap", [1e-2, 1e-6])
-@pytest.mark.parametrize("other_gaps", [(), (1e-7,)], ids=["alone", "beside a nearer one"])
+@pytest.mark.parametrize("other_gaps", [(), (1e-7,)], ids=["alone", "next to a nearer wall"])
 def test_newton_step_is_twice_the_gap(gap, other_gaps):
     """A tool above the arm, pressed down, moves by twice its gap, whatever other gaps there are.
 
     Tolerance 1e-3, as the arm deforms by force/E and a closed point carries the force, plus the gap
     by the size of the mesh, as any step is at most twice that size.
     """
-    moved = step_of(gap, -1e-7, other_gaps)
+    moved = first_newton_displacement(gap, -1e-7, other_gaps)
     assert moved == pytest.approx(-2 * gap, rel=1e-3 + gap)
 
 
 def test_newton_step_with_a_larger_tangential_force():
     """A tool with a larger force along the surface nevertheless closes its gap."""
-    moved = step_of(1e-6, -1e-7, along=2e-7)
+    moved = first_newton_displacement(1e-6, -1e-7, along=2e-7)
     assert moved == pytest.approx(-2e-6, rel=1e-3)
 
 
-@pytest.mark.parametrize("other_gaps", [(), (1e-7,)], ids=["alone", "beside a nearer one"])
+@pytest.mark.parametrize("other_gaps", [(), (1e-7,)], ids=["alone", "next to a nearer wall"])
 def test_newton_step_away_from_the_surface(other_gaps):
     """A tool pushed away from an arm meets nothing, and moves by twice the mesh size, √2."""
-    assert step_of(1e-6, 1e-7, other_gaps) == pytest.approx(2 * np.sqrt(2), rel=1e-3)
+    assert first_newton_displacement(1e-6, 1e-7, other_gaps) == pytest.approx(
+        2 * np.sqrt(2), rel=1e-3
+    )
 
 
 def test_force_above_the_limit_of_the_arm():
     """The error suggests prescribing the displacement instead."""
     with pytest.raises(fc.NotConverged, match="displacement of the obstacle instead of the force"):
-        pushed("force", [1.0], friction=0.2)
+        push_along_cantilever("force", [1.0], friction=0.2)

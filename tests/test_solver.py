@@ -86,7 +86,7 @@ def test_block_far_above_its_floor_is_positioned(cell, condensation):
     forces and more, by round-off of the displacement. At most 21 iterations were needed, up to 293
     or no solution with positioning along the load.
     """
-    found = []
+    computed = []
     for gap in (0.0, 0.05, 0.5):
         scene = block(cell, 1, side=0.05, up=-1.0, n=4 if cell == "triangle" else 2)
         obstacle = fc.HalfSpace(scene.vector(up=-gap), scene.vector(up=1.0))
@@ -94,8 +94,8 @@ def test_block_far_above_its_floor_is_positioned(cell, condensation):
         problem = fc.ContactProblem(scene.F, scene.u, contacts=[contact], condensation=condensation)
         step = problem.solve()
         assert step.iterations <= 25
-        found.append(contact.resultants().tangential_force)
-    assert is_close(found[1], found[0], 1e-6) and is_close(found[2], found[0], 1e-6)
+        computed.append(contact.resultants().tangential_force)
+    assert is_close(computed[1], computed[0], 1e-6) and is_close(computed[2], computed[0], 1e-6)
 
 
 @pytest.mark.parametrize("gaps", [(0.0, 0.05), (1e-4, 1e-5), (0.1, 0.05)])
@@ -105,17 +105,19 @@ def test_stack_of_unconstrained_blocks_is_positioned(gaps):
     Reference: the tangential forces without gaps, to 1e-6. 2 iterations were needed, up to 301
     where round-off decided which points are closed.
     """
-    found = []
+    computed = []
     for low, high in ((0.0, 0.0), gaps):
         body = stack("triangle", (3, 4), (1.0, 1.0), gap=high)
         body.F -= ufl.dot(body.constant((0.05, -1.0)), body.v) * body.ds(ROOF)
         law = fc.Coulomb(friction=0.3)
-        under = body.contact(FLOOR, fc.HalfSpace((0.0, -low), (0.0, 1.0)), law, name="floor")
-        contacts = [under, joint(body, 1, law)]
+        floor_contact = body.contact(
+            FLOOR, fc.HalfSpace((0.0, -low), (0.0, 1.0)), law, name="floor"
+        )
+        contacts = [floor_contact, joint(body, 1, law)]
         step = fc.ContactProblem(body.F, body.u, contacts=contacts).solve()
         assert step.iterations <= 10
-        found.append([contact.resultants().tangential_force for contact in contacts])
-    assert is_close(found[1], found[0], 1e-6)
+        computed.append([contact.resultants().tangential_force for contact in contacts])
+    assert is_close(computed[1], computed[0], 1e-6)
 
 
 @pytest.mark.parametrize("tilt", [-0.1, 0.003])
@@ -166,27 +168,27 @@ def test_forces_balance_on_the_whole_path(method):
     Open, stick and slip points all occur. Reference: the bulk residual, summed over the dofs of
     the top. Tolerance 1e-7 of the force, as the solver's 1e-9 bounds the norm, not the sum.
     """
-    made = BlockOnBall(method=method)
-    space = made.scene.u.function_space
-    bulk = compile_with_maps(made.scene.F)
-    seen = np.zeros(3, dtype=int)
+    setup = BlockOnBall(method=method)
+    space = setup.scene.u.function_space
+    bulk = compile_with_maps(setup.scene.F)
+    n_by_status = np.zeros(3, dtype=int)
     for side, down in PATH:
-        made.set_top_displacement(side, down)
-        step = made.problem.solve()
+        setup.set_top_displacement(side, down)
+        step = setup.problem.solve()
         r = step.contacts["contact"]
         reaction = fem.Function(space)
         fem.assemble_vector(reaction.x.array, bulk)
         reaction.x.scatter_reverse(dolfinx.la.InsertMode.add)
-        dofs = made.scene.facet_dofs(TOP)
+        dofs = setup.scene.facet_dofs(TOP)
         n_owned = space.dofmap.index_map.size_local
         values = reaction.x.array.reshape(-1, 2)[dofs[dofs < n_owned]]
         total = COMM.allreduce(values.sum(axis=0))
         assert is_close(r.force, -total, 1e-7)
         assert r.tangential_force <= 0.3 * r.normal_force * (1 + 1e-10)
-        seen += [r.open, r.stick, r.slip]
-        made.problem.commit()
-        assert made.problem.increment == step.increment
-    assert np.all(seen > 0)
+        n_by_status += [r.open, r.stick, r.slip]
+        setup.problem.commit()
+        assert setup.problem.increment == step.increment
+    assert np.all(n_by_status > 0)
 
 
 # ---- failure leaves no trace ---------------------------------------------------------------------
@@ -200,10 +202,10 @@ def test_failed_increment_leaves_no_trace(method):
     and another problem with the same u and contact solves the increment as one that never failed,
     to 1e-12: the computation is the same except for sums over ranks.
     """
-    made, twin = BlockOnBall(method=method), BlockOnBall(method=method)
-    scene, contact = made.scene, made.contact
-    bcs = [scene.dirichlet_bc(TOP, i, c) for i, c in enumerate(made.push)]
-    for m in (made, twin):
+    setup, reference = BlockOnBall(method=method), BlockOnBall(method=method)
+    scene, contact = setup.scene, setup.contact
+    bcs = [scene.dirichlet_bc(TOP, i, c) for i, c in enumerate(setup.push)]
+    for m in (setup, reference):
         solve_path(m, path=PATH[:2])
     limited = fc.ContactProblem(
         scene.F,
@@ -214,8 +216,8 @@ def test_failed_increment_leaves_no_trace(method):
         petsc_options={"snes_max_it": 1},
         prefix="limited_",
     )
-    before = copy_state(made)
-    made.set_top_displacement(*PATH[2])
+    before = copy_state(setup)
+    setup.set_top_displacement(*PATH[2])
     for _ in range(2):  # the second time with a solver that has failed
         with pytest.raises(fc.NotConverged) as caught:
             limited.solve()
@@ -225,41 +227,41 @@ def test_failed_increment_leaves_no_trace(method):
         assert error.iterations == 1
         assert "increment 1" in str(error) and "1 iterations" in str(error)
         assert error.verdict.failures
-        assert are_identical(copy_state(made), before)
+        assert are_identical(copy_state(setup), before)
         assert limited.increment == 0
-    made.set_top_displacement(*PATH[1])
+    setup.set_top_displacement(*PATH[1])
     assert limited.solve().iterations == 0
     scene.u.x.array[:] = before[0]
-    for m in (made, twin):
+    for m in (setup, reference):
         solve_path(m, path=PATH[2:])
-    assert is_close(nodal_values(scene.u), nodal_values(twin.scene.u), 1e-12)
-    rows = (point_values(m.contact, m.contact.history.rows()) for m in (made, twin))
+    assert is_close(nodal_values(scene.u), nodal_values(reference.scene.u), 1e-12)
+    rows = (point_values(m.contact, m.contact.history.rows()) for m in (setup, reference))
     assert is_close(*rows, 1e-12)
 
 
 def test_increments_restores_the_load():
     """A failing `increments` restores load, u and history of the last committed increment."""
-    made = BlockOnBall(method="newton")
-    steps = fc.increments(made.problem, made.push[1], 0.0, -0.03, steps=3)
+    setup = BlockOnBall(method="newton")
+    steps = fc.increments(setup.problem, setup.push[1], 0.0, -0.03, steps=3)
     done = []
-    before = copy_state(made)
+    before = copy_state(setup)
     with pytest.raises(fc.NotConverged):
         for step in steps:
             done.append(step.load)
-            before = copy_state(made)
+            before = copy_state(setup)
             if len(done) == 2:
-                made.push[0].value = 0.02
-                made.problem.snes.setTolerances(max_it=1)
+                setup.push[0].value = 0.02
+                setup.problem.snes.setTolerances(max_it=1)
     assert done == pytest.approx([-0.01, -0.02], rel=1e-14)
-    assert float(made.push[1].value) == done[-1]
-    assert are_identical(copy_state(made), before)
-    assert made.problem.increment == 2
+    assert float(setup.push[1].value) == done[-1]
+    assert are_identical(copy_state(setup), before)
+    assert setup.problem.increment == 2
 
 
 def test_increments_apply_the_load_in_equal_steps():
     """`increments` applies equal load steps, each solved and committed, numbered from 1."""
-    made = BlockOnBall(fc.Frictionless(k_n=2e4))
-    steps = list(fc.increments(made.problem, made.push[1], 0.0, -0.02, steps=4))
+    setup = BlockOnBall(fc.Frictionless(k_n=2e4))
+    steps = list(fc.increments(setup.problem, setup.push[1], 0.0, -0.02, steps=4))
     assert [s.load for s in steps] == pytest.approx([-0.005, -0.01, -0.015, -0.02], rel=1e-14)
     assert [s.increment for s in steps] == [1, 2, 3, 4]
     forces = [s.contacts["contact"].normal_force for s in steps]
@@ -287,19 +289,19 @@ def test_summary_without_forces(lift):
 def test_reason_against_static_condensation_is_logged_once(caplog):
     """`increments` decides on static condensation again, but the reason is logged once."""
     with caplog.at_level("INFO", logger="fenics_contact"):
-        made = BlockOnBall(condensation=False)
-        list(fc.increments(made.problem, made.push[1], 0.0, -0.01, steps=2))
-    said = [r.message for r in caplog.records if "no static condensation" in r.message]
-    assert len(said) == (COMM.rank == 0)
+        setup = BlockOnBall(condensation=False)
+        list(fc.increments(setup.problem, setup.push[1], 0.0, -0.01, steps=2))
+    messages = [r.message for r in caplog.records if "no static condensation" in r.message]
+    assert len(messages) == (COMM.rank == 0)
 
 
 # ---- pairs and factorisations --------------------------------------------------------------------
 
 
-def recorded(made: BlockOnBall) -> list[float]:
+def record_residual_norms(setup: BlockOnBall) -> list[float]:
     """Return a list to which SNES appends the residual norm of every iteration."""
     norms: list[float] = []
-    made.problem.snes.setMonitor(lambda snes, it, norm: norms.append(norm))
+    setup.problem.snes.setMonitor(lambda snes, it, norm: norms.append(norm))
     return norms
 
 
@@ -310,40 +312,40 @@ def test_lbfgs_pairs_are_discarded_after_each_increment():
     would be the only difference. Residual norms of every iteration agree to 1e-9 of the first,
     round-off of sums over ranks that has grown over some iterations.
     """
-    made = BlockOnBall(fc.Frictionless(k_n=1e3), method="lbfgs")
+    setup = BlockOnBall(fc.Frictionless(k_n=1e3), method="lbfgs")
     runs = []
     for number, (side, down) in enumerate([(0.0, 0.05), (0.01, 0.02), (0.0, 0.05)]):
-        made.scene.u.x.array[:] = 0.0
-        made.set_top_displacement(side, down)
-        norms = recorded(made)
-        step = made.problem.solve()
-        made.problem.snes.cancelMonitor()
+        setup.scene.u.x.array[:] = 0.0
+        setup.set_top_displacement(side, down)
+        norms = record_residual_norms(setup)
+        step = setup.problem.solve()
+        setup.problem.snes.cancelMonitor()
         assert step.factorisations == (number == 0)  # otherwise H₀ would differ too
-        runs.append((step.iterations, np.array(norms), gather(COMM, owned_values(made.scene.u))))
-    first, _, again = runs
-    assert first[0] == again[0] > 3
-    assert first[1].shape == again[1].shape
-    assert np.all(np.abs(again[1] - first[1]) <= 1e-9 * first[1][0])
-    assert is_close(again[2], first[2], 1e-12)
+        runs.append((step.iterations, np.array(norms), gather(COMM, owned_values(setup.scene.u))))
+    first, _, repeated = runs
+    assert first[0] == repeated[0] > 3
+    assert first[1].shape == repeated[1].shape
+    assert np.all(np.abs(repeated[1] - first[1]) <= 1e-9 * first[1][0])
+    assert is_close(repeated[2], first[2], 1e-12)
 
 
 def test_factorisation_is_reused_until_the_modulus_changes():
     """Increments reuse the factorisation of H₀; a change of E requires another."""
-    made = BlockOnBall(fc.Frictionless(k_n=1e3))
-    made.set_top_displacement(0.0, 0.05)
-    assert made.problem.solve().factorisations == 1
-    made.problem.commit()
+    setup = BlockOnBall(fc.Frictionless(k_n=1e3))
+    setup.set_top_displacement(0.0, 0.05)
+    assert setup.problem.solve().factorisations == 1
+    setup.problem.commit()
     for down in (0.055, 0.06, 0.065):
-        made.set_top_displacement(0.0, down)
-        assert made.problem.solve().factorisations == 0
-        made.problem.commit()
-    made.scene.E.value *= 2
-    stiffer = made.problem.solve()
+        setup.set_top_displacement(0.0, down)
+        assert setup.problem.solve().factorisations == 0
+        setup.problem.commit()
+    setup.scene.E.value *= 2
+    stiffer = setup.problem.solve()
     assert stiffer.factorisations >= 1
     # The change takes effect: the contact force of a stiffer body is larger.
-    made.problem.commit()
-    made.scene.E.value /= 2
-    softer = made.problem.solve()
+    setup.problem.commit()
+    setup.scene.E.value /= 2
+    softer = setup.problem.solve()
     assert stiffer.contacts["contact"].normal_force > softer.contacts["contact"].normal_force
 
 
@@ -365,15 +367,15 @@ def test_solving_twice_changes_nothing():
 
     Without a commit the history is the same, so that the state is already a solution.
     """
-    made = BlockOnBall()
-    solve_path(made, path=PATH[:2])
-    made.set_top_displacement(*PATH[2])
-    made.problem.solve()
-    before = gather(COMM, owned_values(made.scene.u))
-    step = made.problem.solve()
+    setup = BlockOnBall()
+    solve_path(setup, path=PATH[:2])
+    setup.set_top_displacement(*PATH[2])
+    setup.problem.solve()
+    before = gather(COMM, owned_values(setup.scene.u))
+    step = setup.problem.solve()
     assert step.iterations == 0
     # Round-off of the conversion to dimensionless u and back.
-    assert is_close(gather(COMM, owned_values(made.scene.u)), before, 1e-14)
+    assert is_close(gather(COMM, owned_values(setup.scene.u)), before, 1e-14)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -382,14 +384,14 @@ def test_constant_load_takes_no_iterations_and_adds_no_slip(method):
 
     Tolerance 1e-12 of the accumulated slip, about 0.01: round-off.
     """
-    made = BlockOnBall(method=method)
+    setup = BlockOnBall(method=method)
     for move in PATH:
-        solve_path(made, path=[move])
-        before = gather(COMM, made.contact.slip)
-        step = made.problem.solve()
-        made.problem.commit()
+        solve_path(setup, path=[move])
+        before = gather(COMM, setup.contact.slip)
+        step = setup.problem.solve()
+        setup.problem.commit()
         assert step.iterations == 0
-        assert is_close(gather(COMM, made.contact.slip), before, 1e-12, scale=0.01)
+        assert is_close(gather(COMM, setup.contact.slip), before, 1e-12, scale=0.01)
 
 
 # ---- methods, units, ranks -----------------------------------------------------------------------
@@ -403,11 +405,11 @@ def test_methods_agree(cell, degree):
     """
     fields = []
     for method in ("lbfgs", "newton"):
-        made = BlockOnBall(cell=cell, degree=degree, method=method)
-        solve_path(made)
-        contact = made.contact
+        setup = BlockOnBall(cell=cell, degree=degree, method=method)
+        solve_path(setup)
+        contact = setup.contact
         rows = (point_values(contact, x) for x in (contact.traction, contact.slip))
-        fields.append((nodal_values(made.scene.u), *rows))
+        fields.append((nodal_values(setup.scene.u), *rows))
     for a, b in zip(*fields, strict=True):
         assert is_close(a, b, 1e-7)
     assert np.abs(fields[0][2]).max() > 1e-3
@@ -425,13 +427,13 @@ def test_solution_is_independent_of_units(method, law):
     path = PATH[:4] if law == "coulomb" else PATH[:1]
     results = []
     for length, pressure in [(1.0, 1.0), (1e-3, 1e6), (1e-9, 1.0), (1.0, 1e-9), (1e-9, 1e9)]:
-        made = BlockOnBall(make, length=length, pressure=pressure, method=method)
-        steps = solve_path(made, length, path)
+        setup = BlockOnBall(make, length=length, pressure=pressure, method=method)
+        steps = solve_path(setup, length, path)
         results.append(
             (
                 [s.iterations for s in steps],
-                nodal_values(made.scene.u) / length,
-                point_values(made.contact, made.contact.traction) / pressure,
+                nodal_values(setup.scene.u) / length,
+                point_values(setup.contact, setup.contact.traction) / pressure,
             )
         )
     for iterations, u, traction in results[1:]:
@@ -456,8 +458,8 @@ def test_resultants_do_not_depend_on_the_number_of_ranks(cell):
     """
     resultants = []
     for comm in (COMM, MPI.COMM_SELF):
-        made = BlockOnBall(cell=cell, mesh=MESHES[cell] | {"comm": comm})
-        steps = solve_path(made, path=PATH[1:5])
+        setup = BlockOnBall(cell=cell, mesh=MESHES[cell] | {"comm": comm})
+        steps = solve_path(setup, path=PATH[1:5])
         resultants.append([s.contacts["contact"] for s in steps])
     for together, alone in zip(*resultants, strict=True):
         size = alone.normal_force
@@ -494,19 +496,19 @@ def test_methods_without_tangent_extrapolate_the_last_increment(method, condensa
     the first increment, to 1e-8 (the solver's tolerance is 1e-9 of the forces).
     """
     scene = block("quadrilateral", n=4)
-    led = fem.Constant(scene.mesh, 0.0)
-    bcs = [*scene.rollers(), scene.dirichlet_bc(TOP, 1, led)]
+    displacement = fem.Constant(scene.mesh, 0.0)
+    bcs = [*scene.rollers(), scene.dirichlet_bc(TOP, 1, displacement)]
     law = fc.Coulomb(10.0, 1e4, 1e4)
     problem, _ = scene.problem(law, bcs, method=method, condensation=condensation)
-    found = []
-    for step in fc.increments(problem, led, 0.0, -0.03, steps=[-0.01, -0.015, -0.03]):
-        found.append((step.iterations, step.method))
-        if len(found) == 1:
+    computed = []
+    for step in fc.increments(problem, displacement, 0.0, -0.03, steps=[-0.01, -0.015, -0.03]):
+        computed.append((step.iterations, step.method))
+        if len(computed) == 1:
             first = nodal_values(scene.u)
-    for step in fc.increments(problem, led, -0.03, -0.004, steps=[-0.02, -0.004]):
-        found.append((step.iterations, step.method))
-    assert [n for n, _ in found[1:]] == [0, 0, 0, 0]
-    assert {by for _, by in found} == {method}
+    for step in fc.increments(problem, displacement, -0.03, -0.004, steps=[-0.02, -0.004]):
+        computed.append((step.iterations, step.method))
+    assert [n for n, _ in computed[1:]] == [0, 0, 0, 0]
+    assert {by for _, by in computed} == {method}
     assert is_close(nodal_values(scene.u), 0.4 * first, 1e-8)
 
 
@@ -516,21 +518,21 @@ def test_methods_without_tangent_extrapolate_the_last_increment(method, condensa
 def test_sound_solve_logs_no_warning(caplog):
     """A successful solve logs no warning."""
     with caplog.at_level(logging.WARNING, logger="fenics_contact"):
-        made = BlockOnBall(fc.Frictionless(k_n=2e4))
-        solve_path(made, path=PATH[:1])
+        setup = BlockOnBall(fc.Frictionless(k_n=2e4))
+        solve_path(setup, path=PATH[:1])
     assert not [r for r in caplog.records if r.name.startswith("fenics_contact")]
 
 
 def test_problem_is_freed_without_garbage_collector() -> None:
     """A problem has no reference cycles: all ranks free its factorisations at the same `del`."""
-    made = BlockOnBall()
-    made.set_top_displacement(*PATH[1])
-    made.problem.solve()
+    setup = BlockOnBall()
+    setup.set_top_displacement(*PATH[1])
+    setup.problem.solve()
     gc.collect()
     gc.disable()
     try:
-        alive = weakref.ref(made.problem)
-        made.problem = None
+        alive = weakref.ref(setup.problem)
+        setup.problem = None
         assert alive() is None
     finally:
         if COMM.size == 1:
@@ -539,31 +541,32 @@ def test_problem_is_freed_without_garbage_collector() -> None:
 
 def test_restore_discards_the_uncommitted_increment() -> None:
     """`restore` resets u and history, after an uncommitted increment, to the last commit."""
-    made = BlockOnBall()
-    made.set_top_displacement(*PATH[1])
-    made.problem.solve()
-    made.problem.commit()
-    before, u = copy_state(made), made.scene.u.x.array.copy()
-    made.set_top_displacement(*PATH[2])
-    made.problem.solve()
+    setup = BlockOnBall()
+    setup.set_top_displacement(*PATH[1])
+    setup.problem.solve()
+    setup.problem.commit()
+    before, u = copy_state(setup), setup.scene.u.x.array.copy()
+    setup.set_top_displacement(*PATH[2])
+    setup.problem.solve()
     assert not np.array_equal(
-        gather(COMM, owned_values(made.scene.u)), gather(COMM, u[: len(owned_values(made.scene.u))])
+        gather(COMM, owned_values(setup.scene.u)),
+        gather(COMM, u[: len(owned_values(setup.scene.u))]),
     )
-    made.problem.restore()
-    assert are_identical(copy_state(made), before)
-    assert np.array_equal(made.scene.u.x.array, u)
+    setup.problem.restore()
+    assert are_identical(copy_state(setup), before)
+    assert np.array_equal(setup.scene.u.x.array, u)
 
 
 @pytest.mark.parametrize("condensation", [None, False])
 def test_newton_after_increment_without_iterations(condensation):
     """An increment without load computes no tangent, and the next one starts without it."""
-    made = BlockOnBall(method="newton", condensation=condensation)
-    made.set_top_displacement(0.0, 0.0)
-    made.scene.u.x.array[:] = 0.0
-    first = made.problem.solve()
-    made.problem.commit()
+    setup = BlockOnBall(method="newton", condensation=condensation)
+    setup.set_top_displacement(0.0, 0.0)
+    setup.scene.u.x.array[:] = 0.0
+    first = setup.problem.solve()
+    setup.problem.commit()
     assert first.iterations == 0
-    solve_path(made, path=PATH[:2])
+    solve_path(setup, path=PATH[:2])
 
 
 @pytest.mark.parametrize("condensation", [None, False])
@@ -575,17 +578,17 @@ def test_newton_predictor_reduces_iterations_on_slip_path(condensation):
     """
     taken, states = [], []
     for helped in (True, False):
-        made = BlockOnBall(method="newton", condensation=condensation, mesh={"n": 12})
+        setup = BlockOnBall(method="newton", condensation=condensation, mesh={"n": 12})
         taken.append(0)
         for i in range(1, 13):
-            made.set_top_displacement(0.004 * i, 0.05)
+            setup.set_top_displacement(0.004 * i, 0.05)
             if not helped:
-                made.problem.restart_solver()
-                state = made.problem.state
-                made.problem.state = replace(state, change=None)
-            taken[-1] += made.problem.solve().iterations
-            made.problem.commit()
-        assert made.contact.resultants().slip > 0
-        states.append(owned_values(made.scene.u).copy())
+                setup.problem.restart_solver()
+                state = setup.problem.state
+                setup.problem.state = replace(state, change=None)
+            taken[-1] += setup.problem.solve().iterations
+            setup.problem.commit()
+        assert setup.contact.resultants().slip > 0
+        states.append(owned_values(setup.scene.u).copy())
     assert taken[0] < 0.8 * taken[1]
     assert is_close(*states, 1e-7)

@@ -36,12 +36,12 @@ def test_options_reach_the_solver(method):
     """Options set the tolerance and the iteration limit, and do not remain in the database."""
     database = PETSc.Options()
     before = database.getAll()
-    made = BlockOnBall(method=method, petsc_options={"snes_max_it": 1, "snes_rtol": 1e-5})
+    setup = BlockOnBall(method=method, petsc_options={"snes_max_it": 1, "snes_rtol": 1e-5})
     assert database.getAll() == before
-    assert made.problem.snes.getTolerances()[0] == 1e-5
-    made.set_top_displacement(0.02, 0.05)
+    assert setup.problem.snes.getTolerances()[0] == 1e-5
+    setup.set_top_displacement(0.02, 0.05)
     with pytest.raises(fc.NotConverged) as caught:
-        made.problem.solve()
+        setup.problem.solve()
     assert caught.value.iterations == 1
 
 
@@ -52,11 +52,11 @@ def test_options_database_overrides_arguments():
     database.setValue(key, 1)
     try:
         before = database.getAll()
-        made = BlockOnBall(petsc_options={"snes_max_it": 500}, prefix="mine_")
+        setup = BlockOnBall(petsc_options={"snes_max_it": 500}, prefix="mine_")
         assert database.getAll() == before
-        made.set_top_displacement(0.02, 0.05)
+        setup.set_top_displacement(0.02, 0.05)
         with pytest.raises(fc.NotConverged) as caught:
-            made.problem.solve()
+            setup.problem.solve()
         assert caught.value.iterations == 1
     finally:
         database.delValue(key)
@@ -65,21 +65,21 @@ def test_options_database_overrides_arguments():
 def test_options_database_changes_the_method():
     """``<prefix>snes_type`` and the linear solver can be chosen in the options database."""
     database = PETSc.Options()
-    given = {"other_snes_type": "newtonls", "other_tangent_pc_factor_mat_solver_type": "petsc"}
+    entries = {"other_snes_type": "newtonls", "other_tangent_pc_factor_mat_solver_type": "petsc"}
     if COMM.size > 1:  # PETSc's own factorisation is serial
-        given.popitem()
-    for key, value in given.items():
+        entries.popitem()
+    for key, value in entries.items():
         database.setValue(key, value)
     try:
-        made = BlockOnBall(prefix="other_")
+        setup = BlockOnBall(prefix="other_")
     finally:
-        for key in given:
+        for key in entries:
             database.delValue(key)
-    assert made.problem.snes.getType() == "newtonls"
-    made.set_top_displacement(*PATH[0])
-    made.problem.solve()
+    assert setup.problem.snes.getType() == "newtonls"
+    setup.set_top_displacement(*PATH[0])
+    setup.problem.solve()
     if COMM.size == 1:
-        assert made.problem.snes.getKSP().getPC().getFactorSolverType() == "petsc"
+        assert setup.problem.snes.getKSP().getPC().getFactorSolverType() == "petsc"
 
 
 def test_two_prefixes_are_independent():
@@ -89,8 +89,8 @@ def test_two_prefixes_are_independent():
     short = BlockOnBall(prefix="short_", petsc_options={"snes_max_it": 3})
     long = BlockOnBall(prefix="long_")
     assert database.getAll() == before
-    for made in (short, long):
-        made.set_top_displacement(0.02, 0.03)
+    for setup in (short, long):
+        setup.set_top_displacement(0.02, 0.03)
     with pytest.raises(fc.NotConverged):
         short.problem.solve()
     step = long.problem.solve()
@@ -166,25 +166,25 @@ def test_user_written_newton_solver_agrees(cell, degree):
     Tolerances over the whole path, relative to the largest value: 1e-8 for u, 1e-7 for tractions
     and slip. `ContactProblem` is solved to 1e-11 of the forces.
     """
-    made = BlockOnBall(cell=cell, degree=degree, petsc_options={"snes_rtol": 1e-11})
-    mine = BlockOnBall(cell=cell, degree=degree)
-    scene = mine.scene
-    bcs = [scene.dirichlet_bc(TOP, i, c) for i, c in enumerate(mine.push)]
-    own = OwnNewton(scene.F, mine.contact, scene.u, bcs)
+    setup = BlockOnBall(cell=cell, degree=degree, petsc_options={"snes_rtol": 1e-11})
+    own_newton = BlockOnBall(cell=cell, degree=degree)
+    scene = own_newton.scene
+    bcs = [scene.dirichlet_bc(TOP, i, c) for i, c in enumerate(own_newton.push)]
+    newton = OwnNewton(scene.F, own_newton.contact, scene.u, bcs)
     for side, down in PATH:
-        made.set_top_displacement(side, down)
-        made.problem.solve()
-        made.problem.commit()
-        mine.set_top_displacement(side, down)
-        own.solve()
-        mine.contact.commit()
+        setup.set_top_displacement(side, down)
+        setup.problem.solve()
+        setup.problem.commit()
+        own_newton.set_top_displacement(side, down)
+        newton.solve()
+        own_newton.contact.commit()
         for name in ("traction", "slip"):
-            a, b = (point_values(m.contact, getattr(m.contact, name)) for m in (mine, made))
+            a, b = (point_values(m.contact, getattr(m.contact, name)) for m in (own_newton, setup))
             assert is_close(a, b, 1e-7, scale=max(np.abs(b).max(), 1e-3)), (name, side, down)
-        a, b = (nodal_values(m.scene.u) for m in (mine, made))
+        a, b = (nodal_values(m.scene.u) for m in (own_newton, setup))
         assert is_close(a, b, 1e-8), (side, down)
-    assert gather(COMM, made.contact.slip).max() > 1e-3
-    for thing in (own.matrix, own.vector, own.x, own.snes):
+    assert gather(COMM, setup.contact.slip).max() > 1e-3
+    for thing in (newton.matrix, newton.vector, newton.x, newton.snes):
         thing.destroy()
 
 
@@ -196,14 +196,14 @@ def test_supported_snes_types_agree(kind, condensation):
 
     Both are solved to 1e-9 of the forces; the states agree to 1e-6.
     """
-    made, usual = (
+    setup, usual = (
         BlockOnBall(method="newton", condensation=condensation, petsc_options=options)
         for options in ({"snes_type": kind}, {})
     )
-    for one in (made, usual):
+    for one in (setup, usual):
         solve_path(one, path=PATH[:3])
-    assert made.problem.snes.getType() == kind
-    assert have_equal_states(made, usual, 1e-6)
+    assert setup.problem.snes.getType() == kind
+    assert have_equal_states(setup, usual, 1e-6)
 
 
 @pytest.mark.whole

@@ -70,15 +70,15 @@ def test_prescribed_normal_traction(cell, method):
     Reference: N = p, T = μ p, uniform. Tolerance 1e-8, ten times that of the solver.
     """
     scene = block(cell, nu=0.0)
-    aside = fem.Constant(scene.mesh, 0.0)
-    bcs = [scene.dirichlet_bc(TOP, i, aside if i == 0 else 0.0) for i in range(scene.dim)]
+    slide = fem.Constant(scene.mesh, 0.0)
+    bcs = [scene.dirichlet_bc(TOP, i, slide if i == 0 else 0.0) for i in range(scene.dim)]
     law = fc.Tresca(0.3, 4.0, k_t=1e4, unilateral=False)
     problem, contact = scene.problem(law, bcs, method=method, contact={"gap": 0.5})
     step = problem.solve()
     problem.commit()
     assert is_close(step.contacts["contact"].force, scene.vector(up=4.0), 1e-8)
     for side in (0.1, -0.1):
-        aside.value = side
+        slide.value = side
         r = problem.solve().contacts["contact"]
         problem.commit()
         assert r.normal_force == pytest.approx(4.0, rel=1e-8)
@@ -98,24 +98,24 @@ def test_tresca_friction(cell):
     fields = []
     for method in ("lbfgs", "newton"):
         law = fc.Tresca(0.3, 8.0, k_n=2e4, k_t=1e4)
-        made = BlockOnBall(
+        setup = BlockOnBall(
             law, cell=cell, method=method, mesh={"n": 4 if cell == "quadrilateral" else 2}
         )
-        steps = solve_path(made, path=PATH[:4])
+        steps = solve_path(setup, path=PATH[:4])
         for step in steps:
             r = step.contacts["contact"]
             assert r.tangential_force <= 0.3 * 8.0 * (1 + 1e-10)
-        fields.append(nodal_values(made.scene.u))
+        fields.append(nodal_values(setup.scene.u))
     assert is_close(*fields, 1e-7)
 
 
 @pytest.mark.parametrize(("alpha", "phi"), [(1.0, 0.0), (0.5, 0.5), (0.0, 0.0)])
 def test_contact_stiffness_in_h0_does_not_change_the_solution(alpha, phi):
     """Solutions do not depend on the contact stiffness that H₀ contains, to 1e-7."""
-    reference, made = BlockOnBall(), BlockOnBall(alpha=alpha, phi=phi)
-    for m in (reference, made):
+    reference, setup = BlockOnBall(), BlockOnBall(alpha=alpha, phi=phi)
+    for m in (reference, setup):
         solve_path(m, path=PATH[:4])
-    a, b = (nodal_values(m.scene.u) for m in (made, reference))
+    a, b = (nodal_values(m.scene.u) for m in (setup, reference))
     assert is_close(a, b, 1e-7)
 
 

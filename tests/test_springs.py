@@ -81,8 +81,8 @@ def test_springs_of_an_inclined_surface(cell, n, weight):
         fc.Coulomb(0.3, k_n=fc.NodalSprings(K_N), k_t=fc.NodalSprings(K_T)),
         weight=None if weight == "none" else 3.0 + x[0] * x[1],
     )
-    for shares, block_of_node in (((1, 0), K_N * along), ((0, 1), K_T * (np.eye(d) - along))):
-        matrix = dense(fc.ContactOperator(contact).springs(contact.values.springs(*shares)), d)
+    for factors, block_of_node in (((1, 0), K_N * along), ((0, 1), K_T * (np.eye(d) - along))):
+        matrix = dense(fc.ContactOperator(contact).springs(contact.values.springs(*factors)), d)
         expected = np.zeros_like(matrix)
         for node in np.flatnonzero(on_surface):
             expected[node, node] = block_of_node
@@ -118,8 +118,8 @@ def test_springs_between_two_bodies(cell):
     )
     assert contact.n_unpaired == 0
     along = np.outer(q[:, -1], q[:, -1])
-    for shares, block_of_pair in (((1, 0), K_N * along), ((0, 1), K_T * (np.eye(d) - along))):
-        matrix = dense(fc.ContactOperator(contact).springs(contact.values.springs(*shares)), d)
+    for factors, block_of_pair in (((1, 0), K_N * along), ((0, 1), K_T * (np.eye(d) - along))):
+        matrix = dense(fc.ContactOperator(contact).springs(contact.values.springs(*factors)), d)
         expected = np.zeros_like(matrix)
         for i in middle:
             (j,) = (j for j in middle if j != i and np.allclose(x[i], x[j], atol=1e-12))
@@ -211,14 +211,16 @@ def test_block_on_foundation(cell, method):
         scene.load(side=side, up=up)
         step = problem.solve()
         problem.commit()
-        found = step.contacts["contact"]
-        assert is_close(found.force, -scene.vector(side=side, up=up), 1e-7, scale=1.0)
-        assert found.normal_force == pytest.approx(-up, abs=1e-7)
+        computed = step.contacts["contact"]
+        assert is_close(computed.force, -scene.vector(side=side, up=up), 1e-7, scale=1.0)
+        assert computed.normal_force == pytest.approx(-up, abs=1e-7)
         jump = gather(COMM, contact.values.jump)
         measure = gather(COMM, contact.measure)
         expected = scene.vector(side=side / 20.0, up=up / 50.0)
         assert is_close(measure @ jump, expected, 1e-7, scale=0.02)
-        assert found.open == found.slip == 0 and found.area == pytest.approx(1.0, rel=1e-12)
+        assert computed.open == computed.slip == 0 and computed.area == pytest.approx(
+            1.0, rel=1e-12
+        )
         assert set(step.verdict.laws["contact"]) == {"stiffness"}
         assert step.verdict.laws["contact"]["stiffness"] <= 1e-10
 
@@ -257,7 +259,7 @@ def test_foundation_without_tangential_stiffness_has_no_slip_history():
 @pytest.mark.parametrize("tension", [True, False])
 def test_foundation_on_half_of_the_surface(tension):
     """Zero stiffness by UFL on half of Γc gives the solution of Γc without that half, to 1e-8."""
-    found = []
+    computed = []
     for everywhere in (True, False):
         scene = block("quadrilateral", n=4, up=-2.0)
         law = fc.Foundation(50.0, 20.0, tension=tension)
@@ -272,8 +274,8 @@ def test_foundation_on_half_of_the_surface(tension):
         step = problem.solve()
         assert max(step.verdict.laws["contact"].values()) <= 1e-10
         force = step.contacts["contact"]
-        found.append((nodal_values(scene.u), np.append(force.force, force.max_pressure)))
-    for one, other in zip(*found, strict=True):
+        computed.append((nodal_values(scene.u), np.append(force.force, force.max_pressure)))
+    for one, other in zip(*computed, strict=True):
         assert is_close(one, other, 1e-8)
 
 
@@ -287,8 +289,8 @@ def test_foundation_of_zero_stiffness(tension, constant):
     """
     scene = block("quadrilateral")
     k = fem.Constant(scene.mesh, 0.0) if constant else 0.0
-    held = [scene.dirichlet_bc(TOP, i) for i in range(2)]
-    problem, _ = scene.problem(fc.Foundation(k, tension=tension), held)
+    bcs = [scene.dirichlet_bc(TOP, i) for i in range(2)]
+    problem, _ = scene.problem(fc.Foundation(k, tension=tension), bcs)
     step = problem.solve()
     assert step.contacts["contact"].normal_force == 0.0
     assert not np.any(gather(COMM, scene.u.x.array))
@@ -300,8 +302,8 @@ def test_foundation_of_zero_stiffness(tension, constant):
         assert problem.solve().contacts["contact"].normal_force == pytest.approx(1.0, abs=1e-7)
 
 
-@pytest.mark.parametrize("what", ["pull", "normal", "tangential"])
-def test_verdict_rejects_wrong_foundation_tractions(what):
+@pytest.mark.parametrize("traction_part", ["pull", "normal", "tangential"])
+def test_verdict_rejects_wrong_foundation_tractions(traction_part):
     """The verdict rejects tractions that differ from those of the foundation's stiffness."""
 
     class Changed(fc.Foundation):
@@ -315,11 +317,11 @@ def test_verdict_rejects_wrong_foundation_tractions(what):
             """Return the tractions of the foundation, modified."""
             r = super().contact_traction(kinematics, parameters)
             r_n, tau = r.normal_traction, r.traction
-            if what == "pull":
+            if traction_part == "pull":
                 r_n = ufl.min_value(r_n, 0.0)
             return fc.ContactTraction(
-                1.01 * r_n if what == "normal" else r_n,
-                1.01 * tau if what == "tangential" else tau,
+                1.01 * r_n if traction_part == "normal" else r_n,
+                1.01 * tau if traction_part == "tangential" else tau,
             )
 
     scene = block("quadrilateral")
@@ -372,20 +374,20 @@ def test_sliding_direction_of_anisotropic_friction(cell, kind, method):
         push[2].value = -0.01
         step = problem.solve()
         problem.commit()
-    found = step.contacts["contact"]
-    assert found.slip > 0 and found.stick == 0
-    assert is_close(found.force[:2] / found.normal_force, -expected, 1e-6)
+    computed = step.contacts["contact"]
+    assert computed.slip > 0 and computed.stick == 0
+    assert is_close(computed.force[:2] / computed.normal_force, -expected, 1e-6)
     assert {"cone", "slip", "dissipation"} <= set(step.verdict.laws["contact"])
 
 
 @pytest.mark.whole
 @pytest.mark.parametrize(
-    ("what", "claim"),
+    ("traction_part", "claim"),
     [("nothing", ""), ("metric", "slip"), ("friction", "cone"), ("modes", "dissipation")],
 )
-def test_verdict_rejects_wrong_anisotropic_law(what, claim):
+def test_verdict_rejects_wrong_anisotropic_law(traction_part, claim):
     """The verdict rejects tractions and slip of another friction surface or metric."""
-    options = {"modes": 5} if what == "modes" else {"transverse_friction": 0.1}
+    options = {"modes": 5} if traction_part == "modes" else {"transverse_friction": 0.1}
 
     class Changed(fc.Coulomb):
         """A law whose return map differs from its parameters or yield functions."""
@@ -398,17 +400,17 @@ def test_verdict_rejects_wrong_anisotropic_law(what, claim):
 
         def tangential_stiffness(self, kinematics, parameters):
             """Return the isotropic stiffness in the case "metric"."""
-            if what == "metric":
+            if traction_part == "metric":
                 return fc.Law.tangential_stiffness(self, kinematics, parameters)
             return super().tangential_stiffness(kinematics, parameters)
 
         def yield_functions(self, kinematics, traction, limit, parameters):
             """Return those of less transverse friction or permuted sides, in two cases."""
-            if what == "friction":
+            if traction_part == "friction":
                 less = 0.9 * parameters["transverse_friction"]
                 parameters = dict(parameters) | {"transverse_friction": less}
-            found = super().yield_functions(kinematics, traction, limit, parameters)
-            return (*found[1:], found[0]) if what == "modes" else found
+            computed = super().yield_functions(kinematics, traction, limit, parameters)
+            return (*computed[1:], computed[0]) if traction_part == "modes" else computed
 
     scene = block("tetrahedron")
     law = Changed(0.3, 1e4, 1e3, direction=(1.0, 0.0, 0.0), **options)
@@ -416,8 +418,8 @@ def test_verdict_rejects_wrong_anisotropic_law(what, claim):
     scene.u.interpolate(lambda x: np.vstack([0.1 + 0 * x[0], 0.07 + 0 * x[0], -0.01 + 0 * x[0]]))
     contact.evaluate()
     assert np.all(gather(COMM, contact.status) == fc.Status.SLIP)
-    found = check_laws(contact)
+    computed = check_laws(contact)
     if claim:
-        assert found[claim] > 1e-3
+        assert computed[claim] > 1e-3
     else:
-        assert max(found.values()) <= 1e-13
+        assert max(computed.values()) <= 1e-13

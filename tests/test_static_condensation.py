@@ -35,15 +35,15 @@ SAME = 1e-7
 TIGHT = {"snes_rtol": 1e-12}
 
 
-def both(make, run):
+def with_and_without_condensation(make, run):
     """Return results of ``run`` for a scene with and without static condensation."""
     return [run(make(condensation=condensed)) for condensed in (True, False)]
 
 
-def assert_same(condensed, whole, rtol=SAME):
-    for name, value in whole.items():
+def assert_same(condensed, full, rtol=SAME):
+    for name, value in full.items():
         # Slip is a difference of displacements.
-        scale = float(np.abs(whole["u"] if name == "slip" else value).max(initial=1e-300))
+        scale = float(np.abs(full["u"] if name == "slip" else value).max(initial=1e-300))
         assert is_close(condensed[name], value, rtol, scale=scale), name
 
 
@@ -68,35 +68,37 @@ def test_schur_complement(cell, degree, symmetric):
         turn = np.zeros((scene.dim, scene.dim))
         turn[0, 1], turn[1, 0] = 300.0, -300.0
         scene.F += ufl.dot(fem.Constant(scene.mesh, turn) * scene.u, v) * ufl.dx(scene.mesh)
-    aside = fem.Constant(scene.mesh, 0.01)
-    bcs = [scene.dirichlet_bc(LEFT, i, aside) for i in range(scene.dim)]
+    slide = fem.Constant(scene.mesh, 0.01)
+    bcs = [scene.dirichlet_bc(LEFT, i, slide) for i in range(scene.dim)]
     problem, _ = scene.problem(fc.Frictionless(), bcs)
     assert problem.full.bulk.symmetric == symmetric
     K = dense(problem.full.bulk.stiffness)
-    n, whole = len(K), problem.full.unknowns
-    touches = find_coupled_dofs(problem.full.operators, whole)
+    n, full = len(K), problem.full.unknowns
+    touches = find_coupled_dofs(problem.full.operators, full)
     # Coupled dofs are all components of all nodes of the bottom, no others.
     y = scene.u.function_space.tabulate_dof_coordinates()[:, scene.dim - 1]
     bottom = np.flatnonzero(np.repeat(np.abs(y) < 1e-12, scene.dim))
-    assert np.array_equal(touches, bottom[bottom < whole.n_local])
-    mine = np.zeros(whole.n_local, dtype=bool)
+    assert np.array_equal(touches, bottom[bottom < full.n_local])
+    constrained_mask = np.zeros(full.n_local, dtype=bool)
     for i in range(scene.dim):
         dofs = scene.facet_dofs(LEFT, i)
-        mine[dofs[dofs < whole.n_local]] = True
-    selection = DofSubset(whole, touches)
-    made = Condensation(problem.full.bulk.stiffness, problem.full.bulk, selection, mine)
-    held, kept = gather(COMM, mine) > 0.5, gather(COMM, whole.first + touches)
-    assert np.array_equal(kept, selection.numbers)
-    inside = np.setdiff1d(np.flatnonzero(~held), kept)
+        constrained_mask[dofs[dofs < full.n_local]] = True
+    selection = DofSubset(full, touches)
+    reduced = Condensation(
+        problem.full.bulk.stiffness, problem.full.bulk, selection, constrained_mask
+    )
+    constrained, retained = gather(COMM, constrained_mask) > 0.5, gather(COMM, full.first + touches)
+    assert np.array_equal(retained, selection.numbers)
+    inside = np.setdiff1d(np.flatnonzero(~constrained), retained)
     inverse = np.linalg.inv(K[np.ix_(inside, inside)])
-    away = K[np.ix_(kept, inside)] @ inverse
-    schur = K[np.ix_(kept, kept)] - away @ K[np.ix_(inside, kept)]
+    away = K[np.ix_(retained, inside)] @ inverse
+    schur = K[np.ix_(retained, retained)] - away @ K[np.ix_(inside, retained)]
     first = COMM.rank == 0
-    assert made.schur.shape == ((kept.size, kept.size) if first else (0, 0))
-    assert not first or is_close(made.schur, schur, 1e-10)
+    assert reduced.schur.shape == ((retained.size, retained.size) if first else (0, 0))
+    assert not first or is_close(reduced.schur, schur, 1e-10)
 
     def part(values):
-        return values[whole.first : whole.first + whole.n_local].copy()
+        return values[full.first : full.first + full.n_local].copy()
 
     rng = np.random.default_rng(3)
     one, other = rng.normal(size=(2, n))
@@ -104,18 +106,18 @@ def test_schur_complement(cell, degree, symmetric):
     for force in (one, other, 2.5 * one - other, rng.normal(size=n)):
         state = rng.normal(size=n)
         if force is not other:
-            state[held] = 0.0
-        made.set_load(part(force), part(state))
-        prescribed = np.where(held & ~np.isin(np.arange(n), kept), state, 0.0)
+            state[constrained] = 0.0
+        reduced.set_load(part(force), part(state))
+        prescribed = np.where(constrained & ~np.isin(np.arange(n), retained), state, 0.0)
         lifted = force - K @ prescribed
-        load = lifted[kept] - away @ lifted[inside]
-        assert not first or is_close(made.particular.load, load, 1e-10)
+        load = lifted[retained] - away @ lifted[inside]
+        assert not first or is_close(reduced.particular.load, load, 1e-10)
         field = prescribed + 0.0
-        field[kept] = state[kept]
+        field[retained] = state[retained]
         field[inside] = inverse @ (force - K @ field)[inside]
-        given = state[kept] if first else np.zeros(0)
-        found = gather(COMM, made.particular.field + made.extend(given))
-        assert is_close(found, field, 1e-10)
+        boundary_values = state[retained] if first else np.zeros(0)
+        computed = gather(COMM, reduced.particular.field + reduced.extend(boundary_values))
+        assert is_close(computed, field, 1e-10)
 
 
 def test_singular_interior_stiffness_is_refused():
@@ -136,17 +138,17 @@ def test_singular_interior_stiffness_is_refused():
 # ---- results with and without condensation -------------------------------------------------------
 
 
-def fields(made, steps=()):
+def final_fields(setup, steps=()):
     """Return the final state, and forces and energies of the increments."""
-    contact = made.contact
-    found = {
-        "u": owned_values(made.scene.u).copy(),
+    contact = setup.contact
+    computed = {
+        "u": owned_values(setup.scene.u).copy(),
         "traction": contact.traction,
         "slip": contact.slip,
     }
-    found["force"] = np.array([s.contacts["contact"].force for s in steps])
-    found["work"] = np.array([[s.energy.work, s.energy.elastic] for s in steps])
-    return found
+    computed["force"] = np.array([s.contacts["contact"].force for s in steps])
+    computed["work"] = np.array([[s.energy.work, s.energy.elastic] for s in steps])
+    return computed
 
 
 LAWS = {
@@ -168,17 +170,17 @@ def test_load_path(cell, degree, law, method):
     """
     iterations = {}
 
-    def run(made):
-        steps = solve_path(made)
-        iterations[made.problem.solver.condensed] = sum(s.iterations for s in steps)
-        if made.problem.solver.condensed:
+    def run(setup):
+        steps = solve_path(setup)
+        iterations[setup.problem.solver.condensed] = sum(s.iterations for s in steps)
+        if setup.problem.solver.condensed:
             assert [s.factorisations for s in steps] == [1, 0, 0, 0, 0, 0]
-        return fields(made, steps)
+        return final_fields(setup, steps)
 
     def make(**options):
         return BlockOnBall(LAWS[law], cell=cell, degree=degree, method=method, **options)
 
-    assert_same(*both(make, run))
+    assert_same(*with_and_without_condensation(make, run))
     assert iterations[True] <= 1.5 * iterations[False]
 
 
@@ -190,7 +192,11 @@ def test_every_cell(cell, degree):
     def make(**options):
         return BlockOnBall(cell=cell, degree=degree, mesh=mesh, **options)
 
-    assert_same(*both(make, lambda made: fields(made, solve_path(made, path=PATH[:4]))))
+    assert_same(
+        *with_and_without_condensation(
+            make, lambda setup: final_fields(setup, solve_path(setup, path=PATH[:4]))
+        )
+    )
 
 
 @pytest.mark.parametrize("cell", CELLS)
@@ -200,13 +206,13 @@ def test_deformable_obstacle(cell):
     results = []
     for condensed in (True, False):
         law = fc.Coulomb(0.3, k_n=1e7, k_t=1e7)
-        made = SlidingBlock(cell, law, start=0.4, n=n, condensation=condensed)
-        steps = [made.step(0.002, along) for along in (0.0, 0.3, 0.6)]
+        setup = SlidingBlock(cell, law, start=0.4, n=n, condensation=condensed)
+        steps = [setup.step(0.002, along) for along in (0.0, 0.3, 0.6)]
         results.append(
             {
                 # Sorted by position, since the partition may differ between the two meshes.
-                "u": nodal_values(made.u),
-                "traction": point_values(made.contact, made.contact.traction),
+                "u": nodal_values(setup.u),
+                "traction": point_values(setup.contact, setup.contact.traction),
                 "force": np.array([s.contacts["contact"].force for s in steps]),
             }
         )
@@ -223,9 +229,9 @@ def test_driven_obstacle(cell, method):
     for condensed in (True, False):
         scene = block(cell, n=4 if cell == "triangle" else 2)
         d = scene.dim
-        drag = fem.Constant(scene.mesh, 0.0)
+        slide = fem.Constant(scene.mesh, 0.0)
         motion = fc.Motion(
-            force=[None] * (d - 1) + [5.0], displacement=[drag] + [0.0] * (d - 2) + [None]
+            force=[None] * (d - 1) + [5.0], displacement=[slide] + [0.0] * (d - 2) + [None]
         )
         problem, contact = scene.problem(
             fc.Coulomb(0.3, k_n=2e4, k_t=1e4),
@@ -234,7 +240,7 @@ def test_driven_obstacle(cell, method):
             method=method,
             condensation=condensed,
         )
-        for drag.value in (0.0, 0.01):
+        for slide.value in (0.0, 0.01):
             problem.solve()
             problem.commit()
         up = float(contact.free_motion[d - 1].value)
@@ -255,33 +261,33 @@ def test_several_contacts_and_loads():
         problem = fc.ContactProblem(
             scene.F, scene.u, contacts=[wall, floor], condensation=condensed
         )
-        found = []
+        computed = []
         for push, up in ((-0.1, -2.0), (-1.0, -2.0), (-1.0, -3.0), (-0.3, -1.0)):
             side.value[0] = push
             scene.load(up=up)
             step = problem.solve()
             problem.commit()
-            found.append([r.force for r in step.contacts.values()])
+            computed.append([r.force for r in step.contacts.values()])
         # The loads are combinations of two fields, so that two solutions suffice.
         if condensed:
             assert len(problem.solver.system.condensation.load_directions) == 2
-        results.append({"u": owned_values(scene.u).copy(), "forces": np.array(found)})
+        results.append({"u": owned_values(scene.u).copy(), "forces": np.array(computed)})
     assert_same(*results)
 
 
 def test_changed_modulus_is_factored_anew():
     """A new modulus between increments causes one new factorisation, and results agree."""
 
-    def run(made):
+    def run(setup):
         steps = []
         for E, move in zip((1000.0, 2000.0, 2000.0, 500.0), PATH[:4], strict=True):
-            made.scene.E.value = E
-            steps += solve_path(made, path=[move])
-        if made.problem.solver.condensed:
+            setup.scene.E.value = E
+            steps += solve_path(setup, path=[move])
+        if setup.problem.solver.condensed:
             assert [s.factorisations for s in steps] == [1, 1, 0, 1]
-        return fields(made, steps)
+        return final_fields(setup, steps)
 
-    assert_same(*both(BlockOnBall, run))
+    assert_same(*with_and_without_condensation(BlockOnBall, run))
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
@@ -289,13 +295,13 @@ def test_results_do_not_depend_on_units(method):
     """Number of iterations and fields are the same in other units, fields to 1e-9."""
     results = []
     for length, pressure in [(1.0, 1.0), (1e-3, 1e6), (1e-9, 1e9)]:
-        made = BlockOnBall(
+        setup = BlockOnBall(
             fc.Coulomb(0.3), length=length, pressure=pressure, method=method, condensation=True
         )
-        steps = solve_path(made, length, PATH[:4])
+        steps = solve_path(setup, length, PATH[:4])
         iterations = [s.iterations for s in steps]
         results.append(
-            (iterations, owned_values(made.scene.u) / length, made.contact.traction / pressure)
+            (iterations, owned_values(setup.scene.u) / length, setup.contact.traction / pressure)
         )
     for iterations, u, traction in results[1:]:
         assert have_similar_iterations(iterations, results[0][0])
@@ -306,23 +312,23 @@ def test_results_do_not_depend_on_units(method):
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_failed_increment_changes_nothing(method):
     """A failed increment changes neither u, nor the history, nor the following increments."""
-    made, twin = (BlockOnBall(method=method, condensation=True) for _ in range(2))
-    for m in (made, twin):
+    setup, reference = (BlockOnBall(method=method, condensation=True) for _ in range(2))
+    for m in (setup, reference):
         solve_path(m, path=PATH[:2])
-    before = made.scene.u.x.array.copy(), made.contact.history.function.x.array.copy()
-    made.set_top_displacement(*PATH[2])
-    kept = made.problem.solver.main.max_it
-    made.problem.solver.main.max_it = 0
-    made.problem.snes.setTolerances(max_it=0)
+    before = setup.scene.u.x.array.copy(), setup.contact.history.function.x.array.copy()
+    setup.set_top_displacement(*PATH[2])
+    max_it = setup.problem.solver.main.max_it
+    setup.problem.solver.main.max_it = 0
+    setup.problem.snes.setTolerances(max_it=0)
     with pytest.raises(fc.NotConverged):
-        made.problem.solve()
-    made.problem.solver.main.max_it = kept
-    made.problem.snes.setTolerances(max_it=kept)
-    after = made.scene.u.x.array, made.contact.history.function.x.array
+        setup.problem.solve()
+    setup.problem.solver.main.max_it = max_it
+    setup.problem.snes.setTolerances(max_it=max_it)
+    after = setup.scene.u.x.array, setup.contact.history.function.x.array
     assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
-    for m in (made, twin):
+    for m in (setup, reference):
         solve_path(m, path=PATH[2:])
-    assert_same(fields(made), fields(twin))
+    assert_same(final_fields(setup), final_fields(reference))
 
 
 def test_indefinite_bulk():
@@ -352,8 +358,8 @@ def test_default_of_condensation_is_logged(caplog):
         problem, contact = scene.problem(law, scene.rollers())
     assert problem.solver.condensed
     if COMM.rank == 0:
-        said = "static condensation onto 10 of 50"
-        assert any(said in record.getMessage() for record in caplog.records)
+        message = "static condensation onto 10 of 50"
+        assert any(message in record.getMessage() for record in caplog.records)
     assert not scene.problem(law, scene.rollers(), condensation=False)[0].solver.condensed
 
     def condensed(F, contacts, **options):

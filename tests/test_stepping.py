@@ -36,23 +36,23 @@ COMM = MPI.COMM_WORLD
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_one_function_can_set_several_loads(cell):
     """In a cycle of two loads set by one function the friction force is reversed."""
-    made = BlockOnBall(cell=cell)
+    setup = BlockOnBall(cell=cell)
     shear = {}
-    for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=8):
-        shear[step.load] = made.contact.resultants().force[0]
+    for step in fc.increments(setup.problem, setup.load, 0.0, 4.0, steps=8):
+        shear[step.load] = setup.contact.resultants().force[0]
     assert list(shear) == pytest.approx(np.arange(1, 9) / 2)
     assert shear[2.0] < 0 < shear[4.0]
-    end = made.contact.resultants()
+    end = setup.contact.resultants()
     assert end.slip > 0 and end.stick == 0
     assert is_close(end.tangential_force, 0.3 * end.normal_force, 1e-12)
 
 
 def test_increments_end_at_the_given_loads():
     """Increments of unequal size end at the given loads."""
-    made = BlockOnBall()
-    steps = fc.increments(made.problem, made.load, 0.0, 2.0, steps=[0.5, 1.0, 1.1, 2.0])
+    setup = BlockOnBall()
+    steps = fc.increments(setup.problem, setup.load, 0.0, 2.0, steps=[0.5, 1.0, 1.1, 2.0])
     assert [s.load for s in steps] == [0.5, 1.0, 1.1, 2.0]
-    assert made.push[0].value == 0.1
+    assert setup.push[0].value == 0.1
 
 
 @pytest.mark.whole
@@ -71,9 +71,9 @@ def test_increments_end_at_the_given_loads():
 )
 def test_invalid_histories_are_refused(load, steps, word):
     """Refused are a load that is no load, and increments that are not monotonic or miss the end."""
-    made = BlockOnBall()
+    setup = BlockOnBall()
     call = lambda: list(  # noqa: E731
-        fc.increments(made.problem, load or made.load, 0.0, 1.0, steps=steps)
+        fc.increments(setup.problem, load or setup.load, 0.0, 1.0, steps=steps)
     )
     assert_raised_on_all_ranks(call, ValueError, word)
 
@@ -81,16 +81,16 @@ def test_invalid_histories_are_refused(load, steps, word):
 @pytest.mark.parametrize(("start", "end"), [(0.0, 5e-324), (1e16, 1e16 + 2), (-1e308, 1e308)])
 def test_increments_below_round_off_are_refused(start, end):
     """Fewer than the three increments asked for would be another load path."""
-    made = BlockOnBall()
-    call = lambda: fc.increments(made.problem, made.load, start, end, steps=3)  # noqa: E731
+    setup = BlockOnBall()
+    call = lambda: fc.increments(setup.problem, setup.load, start, end, steps=3)  # noqa: E731
     assert_raised_on_all_ranks(call, ValueError, "steps is 3", "distinguished")
 
 
 def test_same_file_for_checkpoint_and_csv_is_refused(tmp_path):
     """Each would overwrite the other; nothing is written."""
-    made, path = BlockOnBall(), shared_folder(tmp_path) / "state"
+    setup, path = BlockOnBall(), shared_folder(tmp_path) / "state"
     names = {"checkpoint": path, "csv": path.parent / ".." / path.parent.name / "state"}
-    call = lambda: fc.increments(made.problem, made.load, **names)  # noqa: E731
+    call = lambda: fc.increments(setup.problem, setup.load, **names)  # noqa: E731
     assert_raised_on_all_ranks(call, ValueError, "checkpoint and csv are both")
     assert not path.exists()
 
@@ -100,26 +100,26 @@ def test_same_file_for_checkpoint_and_csv_is_refused(tmp_path):
 
 def test_failed_increments_are_cut_and_enlarged_again():
     """Increments are halved until they converge, doubled after two successes, and reach the end."""
-    made, plain = BlockOnBall(), BlockOnBall()
-    tried = fail_increments_above(made, 0.3)
-    done = [s.load for s in fc.increments(made.problem, made.load, 0.0, 2.0, steps=2)]
+    setup, plain = BlockOnBall(), BlockOnBall()
+    tried = fail_increments_above(setup, 0.3)
+    done = [s.load for s in fc.increments(setup.problem, setup.load, 0.0, 2.0, steps=2)]
     assert done[-1] == 2.0 and 1.0 in done
     assert np.all(np.diff([0.0, *done]) <= 0.3)
     assert len(tried) > len(done)  # increments failed, also after growth
-    asked = list(fc.increments(plain.problem, plain.load, 0.0, 2.0, steps=done))
-    assert made.problem.increment == len(asked) == len(done)
-    assert have_equal_states(made, plain, 1e-7)
+    prescribed = list(fc.increments(plain.problem, plain.load, 0.0, 2.0, steps=done))
+    assert setup.problem.increment == len(prescribed) == len(done)
+    assert have_equal_states(setup, plain, 1e-7)
 
 
 def test_number_of_cuts_is_limited():
     """An increment that never converges raises the error, and the committed state is unchanged."""
-    made = BlockOnBall()
-    fail_increments_above(made, 0.0)
+    setup = BlockOnBall()
+    fail_increments_above(setup, 0.0)
     with pytest.raises(fc.NotConverged):
-        list(fc.increments(made.problem, made.load, 0.0, 1.0, max_cuts=3))
-    assert made.problem.increment == 0
-    assert made.push[1].value == 0.0
-    assert np.all(owned_values(made.scene.u) == 0.0)
+        list(fc.increments(setup.problem, setup.load, 0.0, 1.0, max_cuts=3))
+    assert setup.problem.increment == 0
+    assert setup.push[1].value == 0.0
+    assert np.all(owned_values(setup.scene.u) == 0.0)
 
 
 # ---- energy --------------------------------------------------------------------------------------
@@ -129,8 +129,8 @@ def test_number_of_cuts_is_limited():
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_energy_is_balanced(cell, law):
     """With equilibrium at both ends the balance is exact, up to 1e-6 by the solver's 1e-9."""
-    made = BlockOnBall(law, cell=cell)
-    for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=8):
+    setup = BlockOnBall(law, cell=cell)
+    for step in fc.increments(setup.problem, setup.load, 0.0, 4.0, steps=8):
         e = step.energy
         size = abs(e.work) + abs(e.elastic)
         assert abs(e.imbalance) <= 1e-6 * size
@@ -144,15 +144,15 @@ def test_energy_is_balanced(cell, law):
 
 def test_energy_remainder_converges_with_the_increments():
     """The sum of absolute remainders more than halves when the increments are halved."""
-    shares = []
+    remainders = []
     for n in (8, 16, 32):
-        made = BlockOnBall()
-        steps = list(fc.increments(made.problem, made.load, 0.0, 4.0, steps=n))
+        setup = BlockOnBall()
+        steps = list(fc.increments(setup.problem, setup.load, 0.0, 4.0, steps=n))
         dissipated = sum(s.energy.dissipation for s in steps)
         assert dissipated > 0
-        shares.append(sum(abs(s.energy.remainder) for s in steps) / dissipated)
-    assert shares[2] < 0.5 * shares[1] < 0.25 * shares[0]
-    assert shares[2] < 0.01
+        remainders.append(sum(abs(s.energy.remainder) for s in steps) / dissipated)
+    assert remainders[2] < 0.5 * remainders[1] < 0.25 * remainders[0]
+    assert remainders[2] < 0.01
 
 
 @pytest.mark.parametrize("field", [True, False])
@@ -175,39 +175,48 @@ def test_energy_of_a_driven_obstacle(field):
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-@pytest.mark.parametrize("every", [1, 3])
-def test_restart_gives_identical_digits(cell, method, every, tmp_path):
+@pytest.mark.parametrize("checkpoint_every", [1, 3])
+def test_restart_gives_identical_digits(cell, method, checkpoint_every, tmp_path):
     """A history interrupted after 5 of 8 increments is restarted by a new problem, bit for bit."""
     folder = shared_folder(tmp_path)
-    whole, broken, after = (BlockOnBall(cell=cell, method=method) for _ in range(3))
-    options = {"steps": 8, "checkpoint_every": every}
+    uninterrupted, interrupted, after = (BlockOnBall(cell=cell, method=method) for _ in range(3))
+    options = {"steps": 8, "checkpoint_every": checkpoint_every}
     history = fc.increments(
-        whole.problem, whole.load, 0.0, 4.0, checkpoint=folder / "whole.npz", **options
+        uninterrupted.problem,
+        uninterrupted.load,
+        0.0,
+        4.0,
+        checkpoint=folder / "whole.npz",
+        **options,
     )
     energies = {s.load: s.energy for s in history}
     path = folder / "broken.npz"
-    for step in fc.increments(broken.problem, broken.load, 0.0, 4.0, checkpoint=path, **options):
+    for step in fc.increments(
+        interrupted.problem, interrupted.load, 0.0, 4.0, checkpoint=path, **options
+    ):
         if step.increment == 5:
             break
-    rest = list(fc.increments(after.problem, after.load, 0.0, 4.0, checkpoint=path, **options))
-    assert rest[0].increment == (6 if every == 1 else 4)
-    assert have_equal_states(after, whole, STATE_TOLERANCE)
-    for step in rest:
+    remaining = list(fc.increments(after.problem, after.load, 0.0, 4.0, checkpoint=path, **options))
+    assert remaining[0].increment == (6 if checkpoint_every == 1 else 4)
+    assert have_equal_states(after, uninterrupted, STATE_TOLERANCE)
+    for step in remaining:
         size = abs(energies[step.load].work) + abs(energies[step.load].elastic)
         assert is_close(
             step.energy.work, energies[step.load].work, max(STATE_TOLERANCE, 1e-12), scale=size
         )
     # A third start finds nothing left to do.
-    again = BlockOnBall(cell=cell, method=method)
-    assert not list(fc.increments(again.problem, again.load, 0.0, 4.0, checkpoint=path, **options))
-    assert have_equal_states(again, whole, STATE_TOLERANCE)
+    resumed = BlockOnBall(cell=cell, method=method)
+    assert not list(
+        fc.increments(resumed.problem, resumed.load, 0.0, 4.0, checkpoint=path, **options)
+    )
+    assert have_equal_states(resumed, uninterrupted, STATE_TOLERANCE)
 
 
 def test_checkpoint_of_another_problem_is_refused(tmp_path):
     """The checkpoint of another mesh is refused, and nothing is changed."""
     path = shared_folder(tmp_path) / "state.npz"
-    made = BlockOnBall()
-    list(fc.increments(made.problem, made.load, 0.0, 1.0, checkpoint=path))
+    setup = BlockOnBall()
+    list(fc.increments(setup.problem, setup.load, 0.0, 1.0, checkpoint=path))
     other = BlockOnBall(cell="triangle")
     assert_raised_on_all_ranks(
         lambda: list(fc.increments(other.problem, other.load, checkpoint=path)), ValueError, "mesh"
@@ -231,13 +240,13 @@ def test_failed_write_keeps_the_previous_checkpoint(output, tmp_path, monkeypatc
     The same holds for a disk that loses a byte without an error, because the file is read back.
     """
     path = shared_folder(tmp_path) / "state.npz"
-    made = BlockOnBall()
-    history = fc.increments(made.problem, made.load, 0.0, 2.0, steps=4, checkpoint=path)
+    setup = BlockOnBall()
+    history = fc.increments(setup.problem, setup.load, 0.0, 2.0, steps=4, checkpoint=path)
     next(history)
     before = path.read_bytes()
     COMM.barrier()
 
-    def full(*args, **kwargs):
+    def fail_to_write(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
     def lossy(path, mode):
@@ -245,26 +254,26 @@ def test_failed_write_keeps_the_previous_checkpoint(output, tmp_path, monkeypatc
         return LossyFile(path, mode)
 
     if output:
-        monkeypatch.setattr(np, "savez", full)
+        monkeypatch.setattr(np, "savez", fail_to_write)
     else:
         monkeypatch.setattr(checkpoint_file, "open", lossy, raising=False)
     words = "No space left" if output else "differs from what was written"
     assert_raised_on_all_ranks(lambda: next(history), (OSError, RuntimeError), words)
     assert path.read_bytes() == before
     assert COMM.allgather(os.listdir(path.parent)) == [["state.npz"]] * COMM.size
-    assert made.problem.increment == 2
+    assert setup.problem.increment == 2
 
 
 SCRIPT = """
 import json
 import fenics_contact as fc
 from scenes.block_on_ball import BlockOnBall
-made = BlockOnBall()
-first = made.scene.mesh.comm.rank == 0
-for step in fc.increments(made.problem, made.load, 0.0, 4.0, steps=40, checkpoint={path!r}):
+setup = BlockOnBall()
+first = setup.scene.mesh.comm.rank == 0
+for step in fc.increments(setup.problem, setup.load, 0.0, 4.0, steps=40, checkpoint={path!r}):
     if first:
         print(step.increment, flush=True)
-pressure = made.contact.gather()["pressure"].tolist()
+pressure = setup.contact.gather()["pressure"].tolist()
 if first:
     print(json.dumps(pressure), flush=True)
 """

@@ -65,13 +65,13 @@ def test_load_reversals_agree_with_continuation(condensation):
     """A history with load reversals agrees with that of continuation, to 1e-6."""
     ends = []
     for method in ("newton", "continuation"):
-        rub = BlockOnBall(
+        setup = BlockOnBall(
             coulomb(1e3), mesh={"n": 8}, amplitude=0.05, method=method, condensation=condensation
         )
-        steps = list(fc.increments(rub.problem, rub.load, 0.0, 4.0, steps=8, max_cuts=0))
+        steps = list(fc.increments(setup.problem, setup.load, 0.0, 4.0, steps=8, max_cuts=0))
         assert all(step.energy.dissipation >= 0 for step in steps)
         assert method in [step.method for step in steps]
-        ends.append(nodal_values(rub.scene.u))
+        ends.append(nodal_values(setup.scene.u))
     assert is_close(*ends, 1e-6)
 
 
@@ -97,7 +97,7 @@ def test_multigrid_in_the_plane(k):
     """With multigrid Newton's method agrees with continuation, to 1e-6."""
     ends = []
     for method in ("newton", "continuation"):
-        rub = BlockOnBall(
+        setup = BlockOnBall(
             coulomb(k),
             mesh={"n": 16},
             condensation=False,
@@ -105,11 +105,11 @@ def test_multigrid_in_the_plane(k):
             method=method,
         )
         for side in (0.0, 0.005, 0.03, -0.03):
-            rub.set_top_displacement(side, 0.01)
-            step = rub.problem.solve()
-            rub.problem.commit()
+            setup.set_top_displacement(side, 0.01)
+            step = setup.problem.solve()
+            setup.problem.commit()
         assert step.method == method
-        ends.append(nodal_values(rub.scene.u))
+        ends.append(nodal_values(setup.scene.u))
     assert is_close(*ends, 1e-6)
 
 
@@ -123,9 +123,9 @@ def test_sliding_between_two_bodies():
         slider = two_blocks.SlidingBlock("triangle", coulomb(300.0), start=1.0, method=method)
         steps = [slider.step(0.01, along) for along in (0.0, 0.002, 0.1)]
         assert all(step.method == method for step in steps)
-        found = [step.contacts["contact"] for step in steps]
-        forces.append([value for r in found for value in (r.normal_force, r.tangential_force)])
-        assert found[-1].stick == 0
+        computed = [step.contacts["contact"] for step in steps]
+        forces.append([value for r in computed for value in (r.normal_force, r.tangential_force)])
+        assert computed[-1].stick == 0
     assert is_close(*forces, 1e-7)
 
 
@@ -135,27 +135,27 @@ def test_multipliers_with_stiff_springs():
     The penalty part is 1e-7 of the tractions for both, but points slip differently during the
     augmentations, which changes friction by up to 1e-4.
     """
-    found = []
+    computed = []
     for k in (10.0, 300.0):
         augmented = {"enforcement": "augmented", "tolerance": 1e-7}
-        rub = BlockOnBall(coulomb(k), contact=augmented, method="newton")
-        rub.set_top_displacement(0.06, 0.03)
-        found.append(rub.problem.solve().contacts["contact"])
-    assert is_close(found[0].normal_force, found[1].normal_force, 1e-4)
-    assert is_close(found[0].tangential_force, found[1].tangential_force, 1e-4)
+        setup = BlockOnBall(coulomb(k), contact=augmented, method="newton")
+        setup.set_top_displacement(0.06, 0.03)
+        computed.append(setup.problem.solve().contacts["contact"])
+    assert is_close(computed[0].normal_force, computed[1].normal_force, 1e-4)
+    assert is_close(computed[0].tangential_force, computed[1].tangential_force, 1e-4)
 
 
 def test_iterations_are_independent_of_units():
     """The iterations of all attempts are the same in N-mm and in SI units."""
-    made = []
+    attempts_by_unit = []
     for length, pressure in ((1.0, 1.0), (1e-3, 1e6)):
-        rub = BlockOnBall(
+        setup = BlockOnBall(
             coulomb(1e3), mesh={"n": 8}, length=length, pressure=pressure, method="newton"
         )
-        rub.set_top_displacement(0.01 * length, 0.03 * length)
-        made.append(rub.problem.solve().attempts)
+        setup.set_top_displacement(0.01 * length, 0.03 * length)
+        attempts_by_unit.append(setup.problem.solve().attempts)
     assert have_similar_iterations(
-        *([attempt.iterations for attempt in attempts] for attempts in made)
+        *([attempt.iterations for attempt in attempts] for attempts in attempts_by_unit)
     )
 
 

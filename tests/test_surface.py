@@ -331,10 +331,10 @@ def test_cells_and_nodes_of_facets(cell, degree):
     cells, nodes = facet_cells(mesh, facets), facet_nodes(space, facets)
     mesh.topology.create_connectivity(fdim, mesh.topology.dim)
     to_cell = mesh.topology.connectivity(fdim, mesh.topology.dim)
-    found = [
+    computed = [
         set(nodes[i]) == set(fem.locate_dofs_topological(space, fdim, facets[[i]], remote=False))
         and [cells[i]] == list(to_cell.links(facet))
         for i, facet in enumerate(facets)
     ]
-    assert all(COMM.allgather(all(found)))
+    assert all(COMM.allgather(all(computed)))
     assert len(nodes) == len(cells) == len(facets)

@@ -64,14 +64,14 @@ def test_presets_solve_the_block(preset: str) -> None:
     of converged meshes, met within 3 % (the mesh error is 1.2 %).
     """
     scene = trade_scenes.all_scenes()["GRECO block"]
-    found = trade.solve(scene.make(5.0), trade.replace(scene.base, h=5.0, accuracy=preset))
-    assert "failure" not in found, found["failure"]
-    assert found["normal force"] == pytest.approx(2000.0, rel=1e-3)
-    assert found["friction force"] == pytest.approx(1405.36, rel=0.03)
+    computed = trade.solve(scene.make(5.0), trade.replace(scene.base, h=5.0, accuracy=preset))
+    assert "failure" not in computed, computed["failure"]
+    assert computed["normal force"] == pytest.approx(2000.0, rel=1e-3)
+    assert computed["friction force"] == pytest.approx(1405.36, rel=0.03)
 
 
 def test_page_follows_from_stored_rows() -> None:
     """The page in docs/ is that of the stored rows."""
     advice = (ROOT / "benchmarks" / "trade_advice.md").read_text()
-    made = trade_page.page(trade_scenes.all_scenes(), report.read(STUDY), "trade", advice)
-    assert made == STUDY.with_suffix(".md").read_text()
+    page_text = trade_page.page(trade_scenes.all_scenes(), report.read(STUDY), "trade", advice)
+    assert page_text == STUDY.with_suffix(".md").read_text()

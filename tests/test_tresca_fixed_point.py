@@ -62,9 +62,9 @@ def test_load_cycle_has_the_same_history():
     ends = []
     for method in ("alternating", "lbfgs"):
         law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
-        made = BlockOnBall(law, amplitude=0.05, method=method)
-        list(fc.increments(made.problem, made.load, 0.0, 4.0, steps=8))
-        ends.append(point_values(made.contact, made.contact.history.rows()))
+        setup = BlockOnBall(law, amplitude=0.05, method=method)
+        list(fc.increments(setup.problem, setup.load, 0.0, 4.0, steps=8))
+        ends.append(point_values(setup.contact, setup.contact.history.rows()))
     assert is_close(*ends, 1e-5)
 
 
@@ -83,12 +83,12 @@ def test_force_driven_obstacle_has_the_motion_of_newton():
     motions = []
     for method in ("alternating", "newton"):
         scene = block("quadrilateral", 1, n=4)
-        drag = fem.Constant(scene.mesh, 0.0)
-        obstacle = supporting_ball(2, fc.Motion(force=(drag, 5.0)))
+        slide = fem.Constant(scene.mesh, 0.0)
+        obstacle = supporting_ball(2, fc.Motion(force=(slide, 5.0)))
         bcs = [scene.dirichlet_bc(TOP, i) for i in range(2)]
         law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
         problem, contact = scene.problem(law, bcs, contact={"obstacle": obstacle}, method=method)
-        for drag.value in (0.0, 0.4):
+        for slide.value in (0.0, 0.4):
             problem.solve()
             problem.commit()
         motions.append([float(c.value) for c in contact.free_motion.values()])

@@ -187,8 +187,8 @@ def rings(h: float) -> tuple[dolfinx.mesh.Mesh, dolfinx.mesh.MeshTags]:
                 gmsh.model.addPhysicalGroup(1, lines, tag)
 
             def size(dim, tag, x, y, z, lc):
-                own = tag == parts[0][0] if dim == 2 else tag in inner_lines
-                return h if own else 1.31 * h
+                is_fine = tag == parts[0][0] if dim == 2 else tag in inner_lines
+                return h if is_fine else 1.31 * h
 
             gmsh.model.mesh.setSizeCallback(size)
             gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)
@@ -239,14 +239,14 @@ def test_coarse_slave_surface_on_fine_master_surface(kinematics, fine) -> None:
     penetrates between them and the force is 40 to 50 % less.
     """
     forces = []
-    for own, other in ((LOWER_FACE, UPPER_FACE), (UPPER_FACE, LOWER_FACE)):
+    for slave, other in ((LOWER_FACE, UPPER_FACE), (UPPER_FACE, LOWER_FACE)):
         mesh, tags = two_blocks("quadrilateral", (4, fine), (4.0, 1.0), 1.5)
         u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (2,))))
         down, side = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
         bcs = [dirichlet_bc(u, tags, BOTTOM, i) for i in range(2)]
         bcs += [dirichlet_bc(u, tags, TOP, i, value) for i, value in enumerate((side, down))]
         law = fc.Coulomb(0.3, k_n=10 * E, k_t=10 * E)
-        surface, obstacle = fc.ContactSurface(mesh, tags, own), fc.DeformableBody(tags, other)
+        surface, obstacle = fc.ContactSurface(mesh, tags, slave), fc.DeformableBody(tags, other)
         contact = fc.Contact(u, surface, obstacle, law, kinematics=kinematics)
         F = residual(u, ufl.TestFunction(u.function_space), E, 0.3)
         problem = fc.ContactProblem(F, u, bcs=bcs, contacts=[contact])
@@ -258,7 +258,7 @@ def test_coarse_slave_surface_on_fine_master_surface(kinematics, fine) -> None:
     assert forces[0] == pytest.approx(forces[1], rel=0.12)
 
 
-def _on_a_graded_plate(own, wide, *, space=False, kinematics="finite"):
+def _press_onto_graded_plate(slave, wide, *, space=False, kinematics="finite"):
     """A block on a plate that has 20 facets in its first 1/2, and then facets of length 1/2.
 
     The block has one facet of 1/2, or is as long as the plate (``wide``); 8 facets in 3D, not 20.
@@ -282,9 +282,9 @@ def _on_a_graded_plate(own, wide, *, space=False, kinematics="finite"):
     body.prescribe(BOTTOM, *range(d))
     body.prescribe(TOP, *range(d - 1))
     body.prescribe(TOP, d - 1, value=-0.02)
-    other = {LOWER_FACE: UPPER_FACE, UPPER_FACE: LOWER_FACE}[own]
+    other = {LOWER_FACE: UPPER_FACE, UPPER_FACE: LOWER_FACE}[slave]
     law = fc.Frictionless(k_n=100 * E)
-    contact = body.contact(own, other, law, kinematics=kinematics)
+    contact = body.contact(slave, other, law, kinematics=kinematics)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         problem = body.problem(contact)
@@ -299,8 +299,8 @@ def test_small_block_on_fine_end_of_graded_plate(kinematics) -> None:
     length, 2 and 17 % of it were missing.
     """
     forces = []
-    for own in (UPPER_FACE, LOWER_FACE):
-        problem, contact, _ = _on_a_graded_plate(own, wide=False, kinematics=kinematics)
+    for slave in (UPPER_FACE, LOWER_FACE):
+        problem, contact, _ = _press_onto_graded_plate(slave, wide=False, kinematics=kinematics)
         problem.solve()
         forces.append(contact.resultants().normal_force)
     assert forces[0] == pytest.approx(forces[1], rel=0.01)
@@ -308,8 +308,8 @@ def test_small_block_on_fine_end_of_graded_plate(kinematics) -> None:
 
 def test_warning_for_fine_end_under_long_surface_in_3d() -> None:
     """A twelfth of Γc is on facets 6 times shorter in their longest sides, 8 times in one side."""
-    for own, expected in ((UPPER_FACE, ["6 times"]), (LOWER_FACE, [])):
-        _, contact, texts = _on_a_graded_plate(own, wide=True, space=True)
+    for slave, expected in ((UPPER_FACE, ["6 times"]), (LOWER_FACE, [])):
+        _, contact, texts = _press_onto_graded_plate(slave, wide=True, space=True)
         assert contact.quadrature.degree == (6 if expected else 2)
         assert len(texts) == len(expected)
         assert all(times in text for times, text in zip(expected, texts, strict=True))
@@ -320,7 +320,7 @@ def test_sliding_onto_finer_facets_fails_without_enough_points() -> None:
 
     Unverified, the force was more than 15 % below that with the points that 20 facets need.
     """
-    for given in (None, 78):
+    for quadrature in (None, 78):
         x = np.r_[np.linspace(0.0, 0.5, 21), np.arange(1.0, 20.1, 0.5)]
         axes = [[x, np.linspace(0.0, 1.0, 9)], [np.array([2.0, 2.5]), np.linspace(1.0, 1.5, 5)]]
         sides = {
@@ -335,10 +335,12 @@ def test_sliding_onto_finer_facets_fails_without_enough_points() -> None:
         body.prescribe(TOP, 0, value=side)
         body.prescribe(TOP, 1, value=-0.02)
         law = fc.Frictionless(k_n=100 * E)
-        contact = body.contact(UPPER_FACE, LOWER_FACE, law, quadrature=given, kinematics="finite")
+        contact = body.contact(
+            UPPER_FACE, LOWER_FACE, law, quadrature=quadrature, kinematics="finite"
+        )
         problem = body.problem(contact)
         for side.value in (0.0, -1.0, -2.0):
-            if given is None and side.value == -2.0:
+            if quadrature is None and side.value == -2.0:
                 assert_raised_on_all_ranks(problem.solve, fc.NotConverged, "penetrates")
             else:
                 problem.solve()
@@ -352,19 +354,19 @@ def test_quadrature_degree_follows_opposing_facets(cell) -> None:
     d, law = mesh.geometry.dim, fc.Frictionless(k_n=E)
     u = fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (d,))))
     degrees = []
-    for own, other, given in (
+    for slave, other, quadrature in (
         (LOWER_FACE, UPPER_FACE, None),
         (UPPER_FACE, LOWER_FACE, None),
         (LOWER_FACE, UPPER_FACE, 3),
     ):
-        surface = fc.ContactSurface(mesh, tags, own, quadrature_degree=given)
+        surface = fc.ContactSurface(mesh, tags, slave, quadrature_degree=quadrature)
         contact = fc.Contact(u, surface, fc.DeformableBody(tags, other), law)
         degrees.append(contact.quadrature.degree)
     assert degrees == [{2: 38, 3: 6}[d], 2, 3]  # 2n - 2: n points a side; limit 6 in 3D
 
 
-def _pressed_by(
-    cell, times, *, degree=1, own=LOWER_FACE, kinematics="finite", given=None, **options
+def _press_onto_one_cell(
+    cell, times, *, degree=1, slave=LOWER_FACE, kinematics="finite", quadrature=None, **options
 ):
     """A block of ``times`` cells per side, moved down by a tenth of its height onto one cell."""
     mesh, tags = two_blocks(cell, (1, times))
@@ -373,9 +375,9 @@ def _pressed_by(
     down = fem.Constant(mesh, -0.05)
     bcs = [dirichlet_bc(u, tags, tag, i) for tag in (BOTTOM, TOP) for i in range(d - 1)]
     bcs += [dirichlet_bc(u, tags, BOTTOM, d - 1), dirichlet_bc(u, tags, TOP, d - 1, down)]
-    surface = fc.ContactSurface(mesh, tags, own, quadrature_degree=given)
+    surface = fc.ContactSurface(mesh, tags, slave, quadrature_degree=quadrature)
     obstacle = fc.DeformableBody(
-        tags, {LOWER_FACE: UPPER_FACE, UPPER_FACE: LOWER_FACE}.get(own, own)
+        tags, {LOWER_FACE: UPPER_FACE, UPPER_FACE: LOWER_FACE}.get(slave, slave)
     )
     law = fc.Frictionless(k_n=10 * E)
     contact = fc.Contact(u, surface, obstacle, law, kinematics=kinematics)
@@ -397,12 +399,12 @@ def test_warning_if_quadrature_is_too_coarse(cell, degree, times, caplog) -> Non
     hexahedra (asserted: 2 %); linear cells fail, since edges of the fine block enter Γc.
     With the degree of the warning at most 0.4 % are missing (asserted: 1 %).
     """
-    problem, contact, texts = _pressed_by(cell, times, degree=degree)
-    wanted = times * (2 * degree + 2) - 2
+    problem, contact, texts = _press_onto_one_cell(cell, times, degree=degree)
+    expected = times * (2 * degree + 2) - 2
     assert len(texts) == 1
-    assert f"{times} times" in texts[0] and f"quadrature_degree={wanted})" in texts[0]
-    told = [r.getMessage() for r in caplog.records if r.name == "fenics_contact"]
-    assert told.count(texts[0]) == (COMM.rank == 0)
+    assert f"{times} times" in texts[0] and f"quadrature_degree={expected})" in texts[0]
+    messages = [r.getMessage() for r in caplog.records if r.name == "fenics_contact"]
+    assert messages.count(texts[0]) == (COMM.rank == 0)
     if degree == 1:
         assert_raised_on_all_ranks(problem.solve, fc.NotConverged, "has crossed")
         coarse = 0.0
@@ -410,8 +412,8 @@ def test_warning_if_quadrature_is_too_coarse(cell, degree, times, caplog) -> Non
         problem.solve()
         coarse = contact.resultants().normal_force
     forces = []
-    for options in ({"own": UPPER_FACE}, {"given": wanted}):
-        problem, contact, texts = _pressed_by(cell, times, degree=degree, **options)
+    for options in ({"slave": UPPER_FACE}, {"quadrature": expected}):
+        problem, contact, texts = _press_onto_one_cell(cell, times, degree=degree, **options)
         assert not texts
         problem.solve()
         forces.append(contact.resultants().normal_force)
@@ -428,8 +430,8 @@ def test_warning_if_opposing_surface_ends_within_facets(cell, n, width) -> None:
     Reference: the force with Γc on the block, of which 8 and 13 % are missing (asserted: 7 %);
     with enough points it differs by 1 % (asserted: 2 %), since Γc is the other surface.
     """
-    forces, told = [], []
-    for own, other, degree in (
+    forces, messages = [], []
+    for slave, other, degree in (
         (LOWER_FACE, UPPER_FACE, None),
         (LOWER_FACE, UPPER_FACE, 30),
         (UPPER_FACE, LOWER_FACE, None),
@@ -440,7 +442,7 @@ def test_warning_if_opposing_surface_ends_within_facets(cell, n, width) -> None:
         bcs = [dirichlet_bc(u, tags, tag, i) for tag in (BOTTOM, TOP) for i in range(d - 1)]
         down = fem.Constant(mesh, -0.02)
         bcs += [dirichlet_bc(u, tags, BOTTOM, d - 1), dirichlet_bc(u, tags, TOP, d - 1, down)]
-        surface = fc.ContactSurface(mesh, tags, own, quadrature_degree=degree)
+        surface = fc.ContactSurface(mesh, tags, slave, quadrature_degree=degree)
         obstacle, law = fc.DeformableBody(tags, other), fc.Frictionless(k_n=10 * E)
         contact = fc.Contact(u, surface, obstacle, law, kinematics="finite")
         F = residual(u, ufl.TestFunction(u.function_space), E, 0.3)
@@ -450,16 +452,16 @@ def test_warning_if_opposing_surface_ends_within_facets(cell, n, width) -> None:
             for _ in range(2):
                 problem.solve()
                 problem.commit()
-        told.append(sum("opposing surface ends" in str(w.message) for w in caught))
+        messages.append(sum("opposing surface ends" in str(w.message) for w in caught))
         forces.append(contact.resultants().normal_force)
-    assert told == [1, 0, 0]
+    assert messages == [1, 0, 0]
     assert forces[0] < 0.93 * forces[2]
     assert forces[1] == pytest.approx(forces[2], rel=0.02)
 
 
 @pytest.mark.whole
 @pytest.mark.parametrize(
-    ("here", "there", "told"),
+    ("slave_counts", "master_counts", "expected"),
     [
         ((1, 1), (1, 4), False),
         ((1, 1), (1, 8), True),
@@ -467,17 +469,17 @@ def test_warning_if_opposing_surface_ends_within_facets(cell, n, width) -> None:
         ((1, 8), (1, 8), False),
     ],
 )
-def test_narrow_facets_are_counted_along_both_sides(here, there, told) -> None:
+def test_narrow_facets_are_counted_along_both_sides(slave_counts, master_counts, expected) -> None:
     """All facets have equal longest sides; the surfaces have (along x, along y) facets.
 
     Reference: the force with 9 points per side (degree 16), to 1 %. With two points per side, as
     for equal facets, 5.7, 7 and 5 % of it were missing without a warning.
     """
     forces = []
-    for given in (None, 16):
+    for quadrature in (None, 16):
         axes = [
             [np.linspace(0, 1, n + 1) for n in counts] + [np.linspace(low, low + 1, 3)]
-            for counts, low in ((here, 0.0), (there, 1.0))
+            for counts, low in ((slave_counts, 0.0), (master_counts, 1.0))
         ]
         body = Bodies(
             boxes(
@@ -496,12 +498,14 @@ def test_narrow_facets_are_counted_along_both_sides(here, there, told) -> None:
         body.prescribe(TOP, 0, 1)
         body.prescribe(TOP, 2, value=-0.01)
         law = fc.Frictionless(k_n=10 * E)
-        contact = body.contact(LOWER_FACE, UPPER_FACE, law, quadrature=given, kinematics="finite")
+        contact = body.contact(
+            LOWER_FACE, UPPER_FACE, law, quadrature=quadrature, kinematics="finite"
+        )
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             problem = body.problem(contact)
         texts = [str(w.message) for w in caught if "times as long" in str(w.message)]
-        assert len(texts) == (told and given is None)
+        assert len(texts) == (expected and quadrature is None)
         assert all("8 times" in text for text in texts)
         problem.solve()
         forces.append(contact.resultants().normal_force)
@@ -521,7 +525,7 @@ def test_narrow_facets_are_counted_along_both_sides(here, there, told) -> None:
 def test_default_method_for_linear_bodies(kinematics, solver, method) -> None:
     """Newton's method for finite kinematics and a direct solver, else L-BFGS (one tangent)."""
     options = {"kinematics": kinematics, "linear_solver": solver, "condensation": False}
-    problem, _, _ = _pressed_by("hexahedron", 2, **options)
+    problem, _, _ = _press_onto_one_cell("hexahedron", 2, **options)
     assert problem.solve().attempts[0].method == method
 
 
@@ -550,12 +554,12 @@ def test_no_warning_if_quadrature_error_is_small() -> None:
         ("tetrahedron", 5, {}),
         ("hexahedron", 2, {"degree": 2}),
         ("hexahedron", 8, {"kinematics": "small"}),
-        ("hexahedron", 8, {"given": 2}),
-        ("hexahedron", 8, {"own": (LOWER_FACE, UPPER_FACE)}),
+        ("hexahedron", 8, {"quadrature": 2}),
+        ("hexahedron", 8, {"slave": (LOWER_FACE, UPPER_FACE)}),
         ("quadrilateral", 80, {}),
         ("triangle", 40, {"degree": 2}),
     ):
-        assert _pressed_by(cell, times, **options)[2] == [], (cell, times, options)
+        assert _press_onto_one_cell(cell, times, **options)[2] == [], (cell, times, options)
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
@@ -572,15 +576,17 @@ def test_relative_stiffness_uses_the_softer_body(cell, contrast, swap) -> None:
     modulus = fem.Function(fem.functionspace(mesh, ("DG", 0)))
     modulus.interpolate(lambda x: np.where(x[d - 1] > 0.5, E, contrast * E))
     v = ufl.TestFunction(u.function_space)
-    own, other = (LOWER_FACE, UPPER_FACE) if swap else (UPPER_FACE, LOWER_FACE)
+    slave, other = (LOWER_FACE, UPPER_FACE) if swap else (UPPER_FACE, LOWER_FACE)
     law = fc.Frictionless(k_n=fc.RelativeStiffness(3.0))
-    contact = fc.Contact(u, fc.ContactSurface(mesh, tags, own), fc.DeformableBody(tags, other), law)
+    contact = fc.Contact(
+        u, fc.ContactSurface(mesh, tags, slave), fc.DeformableBody(tags, other), law
+    )
     bcs = [dirichlet_bc(u, tags, tag, i) for tag in (BOTTOM, TOP) for i in range(d)]
     fc.ContactProblem(residual(u, v, modulus, 0.3), u, bcs=bcs, contacts=[contact])
     contact.evaluate()
     stiffness = contact.values.normal_stiffness
-    wanted = 3.0 * min(contrast, 1.0) * E / (0.5 if swap else 0.25)
-    assert stiffness == pytest.approx(np.full(len(stiffness), wanted), rel=1e-6)
+    expected = 3.0 * min(contrast, 1.0) * E / (0.5 if swap else 0.25)
+    assert stiffness == pytest.approx(np.full(len(stiffness), expected), rel=1e-6)
 
 
 def test_unconstrained_body_is_named() -> None:

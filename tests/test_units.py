@@ -24,7 +24,7 @@ UNITS = [(1.0, 1.0), (1e-3, 1e6), (0.7, 3.3)]
 CONDENSATION = [None, False]
 
 
-def same(results) -> None:
+def assert_results_agree(results) -> None:
     """Check that iterations differ by at most one per increment, and fields by 1e-9 (round-off)."""
     for iterations, *fields in results[1:]:
         assert have_similar_iterations(iterations, results[0][0])
@@ -42,7 +42,7 @@ def test_load_reversal_is_independent_of_units(cell, degree, n, method, condensa
     """A block is pressed on a ball, dragged in both directions, and lifted."""
     results = []
     for length, pressure in UNITS:
-        made = BlockOnBall(
+        setup = BlockOnBall(
             fc.Coulomb(0.3),
             cell=cell,
             degree=degree,
@@ -57,12 +57,12 @@ def test_load_reversal_is_independent_of_units(cell, degree, n, method, condensa
             method=method,
             condensation=condensation,
         )
-        steps = solve_path(made, length)
-        traction = point_values(made.contact, made.contact.traction) / pressure
+        steps = solve_path(setup, length)
+        traction = point_values(setup.contact, setup.contact.traction) / pressure
         results.append(
-            ([s.iterations for s in steps], nodal_values(made.scene.u) / length, traction)
+            ([s.iterations for s in steps], nodal_values(setup.scene.u) / length, traction)
         )
-    same(results)
+    assert_results_agree(results)
 
 
 # Without L-BFGS for Tresca's law: open points have friction, so that it takes up to 40 iterations,
@@ -81,7 +81,7 @@ def test_friction_in_3d_is_independent_of_units(law, method):
     """A block in 3D is pressed and dragged, with every friction law."""
     results = []
     for length, pressure in UNITS:
-        made = BlockOnBall(
+        setup = BlockOnBall(
             {
                 "cone": fc.Coulomb(0.3),
                 "multipliers": fc.Coulomb(0.3),
@@ -100,12 +100,12 @@ def test_friction_in_3d_is_independent_of_units(law, method):
             pressure=pressure,
             method=method,
         )
-        steps = solve_path(made, length, PATH[:5])
-        traction = point_values(made.contact, made.contact.traction) / pressure
+        steps = solve_path(setup, length, PATH[:5])
+        traction = point_values(setup.contact, setup.contact.traction) / pressure
         results.append(
-            ([s.iterations for s in steps], nodal_values(made.scene.u) / length, traction)
+            ([s.iterations for s in steps], nodal_values(setup.scene.u) / length, traction)
         )
-    same(results)
+    assert_results_agree(results)
 
 
 @pytest.mark.each
@@ -121,10 +121,10 @@ def test_two_bodies_are_independent_of_units(method, condensation):
         V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
         u, v = fem.Function(V), ufl.TestFunction(V)
         move = [fem.Constant(mesh, 0.0) for _ in range(2)]
-        still = fem.Constant(mesh, 0.0)
+        zero = fem.Constant(mesh, 0.0)
         bcs = [
             fem.dirichletbc(c, fem.locate_dofs_topological(V.sub(i), 1, tags.find(tag)), V.sub(i))
-            for tag, values in ((BOTTOM, [still, still]), (TOP, move))
+            for tag, values in ((BOTTOM, [zero, zero]), (TOP, move))
             for i, c in enumerate(values)
         ]
         body = fc.elasticity.LinearElastic(u, 1000.0 * pressure, 0.3, "plane strain")
@@ -149,4 +149,4 @@ def test_two_bodies_are_independent_of_units(method, condensation):
             problem.commit()
         traction = point_values(contact, contact.traction) / pressure
         results.append((iterations, nodal_values(u) / length, traction))
-    same(results)
+    assert_results_agree(results)

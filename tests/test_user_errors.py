@@ -163,10 +163,10 @@ def test_tags_of_another_mesh_are_refused():
 
 def same_obstacle_warnings(make):
     """Return the warnings that contacts have the same obstacle."""
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         make()
-    return [str(one.message) for one in told if "same obstacle" in str(one.message)]
+    return [str(one.message) for one in caught if "same obstacle" in str(one.message)]
 
 
 def warnings_of_second_contact(scene, obstacle, **options):
@@ -185,8 +185,8 @@ def test_two_contacts_with_the_same_obstacle_warn():
     scene = pressed_block()
     plane = fc.HalfSpace(point=(0.3, 0.0), normal=(0.0, 2.0))
     for obstacle in (scene.floor(), plane):
-        (told,) = warnings_of_second_contact(scene, obstacle)
-        assert told.startswith("floor and other have the same obstacle at 2 facets")
+        (caught,) = warnings_of_second_contact(scene, obstacle)
+        assert caught.startswith("floor and other have the same obstacle at 2 facets")
 
 
 def test_different_obstacles_of_one_surface_do_not_warn():

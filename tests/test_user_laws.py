@@ -50,15 +50,17 @@ def test_overclosure(cell, method, condensation):
         scene.load(up=-p)
         step = problem.solve()
         assert step.verdict.failures == []
-        assert is_close(gather(COMM, contact.pressure), np.full_like(_ones(contact), p), EXACT)
+        assert is_close(
+            gather(COMM, contact.pressure), np.full_like(_ones_at_points(contact), p), EXACT
+        )
         overclosure = -gather(COMM, contact.gap)
-        assert is_close(overclosure, H * np.log(p / P0) * _ones(contact), EXACT, scale=H)
+        assert is_close(overclosure, H * np.log(p / P0) * _ones_at_points(contact), EXACT, scale=H)
         problem.commit()
     # For a nonlinear law the trapezoidal work is inexact; the energy of its springs is exact.
     assert step.energy.springs == pytest.approx(H * (20.0 - 3.0), rel=1e-6)
 
 
-def _ones(contact):
+def _ones_at_points(contact):
     return np.ones(len(gather(COMM, contact.pressure)))
 
 
@@ -78,10 +80,12 @@ def test_softening_adhesive_is_unloaded(cell, condensation):
         step = problem.solve()
         assert step.verdict.failures == []
         problem.commit()
-        assert is_close(-gather(COMM, contact.pressure), pull * _ones(contact), EXACT, scale=1.0)
+        assert is_close(
+            -gather(COMM, contact.pressure), pull * _ones_at_points(contact), EXACT, scale=1.0
+        )
         opening = gather(COMM, contact.gap)
         assert is_close(
-            1e3 * opening * np.exp(-opening / 1e-2), pull * _ones(contact), EXACT, scale=1
+            1e3 * opening * np.exp(-opening / 1e-2), pull * _ones_at_points(contact), EXACT, scale=1
         )
 
 
@@ -93,9 +97,9 @@ def test_newton_recovers_from_a_step_that_is_too_deep():
     pressure, to 1e-8, as the residual is 1e-9 of the pressure.
     """
     scene = block("quadrilateral", E=1000.0, nu=0.0)
-    apart = {"obstacle": fc.HalfSpace((0.0, -H), (0.0, 1.0))}
+    options = {"obstacle": fc.HalfSpace((0.0, -H), (0.0, 1.0))}
     problem, contact = scene.problem(
-        Overclosure(P0, H), scene.rollers(), contact=apart, method="newton"
+        Overclosure(P0, H), scene.rollers(), contact=options, method="newton"
     )
     scene.load(up=-25.0 * P0)
     step = problem.solve()
@@ -105,14 +109,14 @@ def test_newton_recovers_from_a_step_that_is_too_deep():
 
 def test_any_units():
     """Relative results are the same in MPa and Pa, in metres and micrometres, to 1e-7."""
-    found = []
+    computed = []
     for force, length in ((1.0, 1.0), (1e6, 1.0), (1.0, 1e6)):
         size = [length, length]
         scene = block("quadrilateral", E=E * force, nu=NU, up=-3.0 * force, size=size)
         problem, contact = scene.problem(Overclosure(P0 * force, H * length), scene.rollers())
         problem.solve()
-        found.append(-gather(COMM, contact.gap) / length)
-    assert is_close(found[1], found[0], EXACT) and is_close(found[2], found[0], EXACT)
+        computed.append(-gather(COMM, contact.gap) / length)
+    assert is_close(computed[1], computed[0], EXACT) and is_close(computed[2], computed[0], EXACT)
 
 
 @pytest.mark.each
@@ -128,10 +132,10 @@ def test_overclosure_with_friction(cell, method, condensation):
     scene = block(cell, E=E, nu=NU, n=3)
     d = scene.dim
     push, press = (scene.dirichlet_bc(TOP, i) for i in (0, d - 1))
-    held = [scene.dirichlet_bc(TOP, 1)] if d == 3 else []
+    bcs = [scene.dirichlet_bc(TOP, 1)] if d == 3 else []
     problem, contact = scene.problem(
         AsperityFriction(mu, P0, H, fc.RelativeStiffness()),
-        [push, press, *held],
+        [push, press, *bcs],
         method=method,
         condensation=condensation,
     )
@@ -151,13 +155,13 @@ def test_overclosure_with_friction(cell, method, condensation):
     assert step.energy.dissipation > 0
 
 
-def dragged(law, cell="quadrilateral", **options):
+def slipping_block(law, cell="quadrilateral", **options):
     """Return a block pressed on a plane by its top and dragged until all points slip."""
     scene = block(cell, E=E, nu=NU, n=3)
     d = scene.dim
     push, press = (scene.dirichlet_bc(TOP, i) for i in (0, d - 1))
-    held = [scene.dirichlet_bc(TOP, 1)] if d == 3 else []
-    problem, contact = scene.problem(law, [push, press, *held], **options)
+    bcs = [scene.dirichlet_bc(TOP, 1)] if d == 3 else []
+    problem, contact = scene.problem(law, [push, press, *bcs], **options)
     push.g.value[...], press.g.value[...] = 4e-2, -2e-2
     return scene, problem, contact
 
@@ -169,7 +173,7 @@ def test_friction_bound_nonlinear_in_the_pressure(cell, method, condensation):
     """All points slip: |τ| is the friction bound at their pressure, to the solver's 1e-9."""
     mu, strength = 0.5, 4.0
     law = SaturatingFriction(mu, strength, fc.RelativeStiffness(), fc.RelativeStiffness())
-    _, problem, contact = dragged(law, cell, method=method, condensation=condensation)
+    _, problem, contact = slipping_block(law, cell, method=method, condensation=condensation)
     step = problem.solve()
     assert step.verdict.failures == [] and step.contacts["contact"].stick == 0
     p, tau = (gather(COMM, v) for v in (contact.pressure, contact.tangential_traction))
@@ -183,16 +187,16 @@ def test_enforcement_error_uses_the_derivative_of_the_friction_bound():
     Reference: a penalty 1000 times as stiff. With the pressure instead of the derivative of the
     friction bound, as for Coulomb's law, the estimate would be 5 times too large.
     """
-    found = []
+    computed = []
     for factor in (3.0, 3e3):
         law = SaturatingFriction(
             0.5, 4.0, fc.RelativeStiffness(factor), fc.RelativeStiffness(factor)
         )
-        scene, problem, _ = dragged(law)
+        scene, problem, _ = slipping_block(law)
         problem.solve()
         budget = fc.estimate_errors(problem, stress(scene.u, E, NU))
-        found.append(budget)
-    soft, stiff = found
+        computed.append(budget)
+    soft, stiff = computed
     name = "friction force"
     error = soft.values[name] - stiff.values[name]
     assert soft.parts["enforcement"][name] == pytest.approx(error, rel=0.3)
@@ -271,7 +275,7 @@ def test_inconsistent_friction_bound_is_caught():
             more = {**parameters, "strength": 2 * parameters["strength"]}
             return super().contact_traction(kinematics, more)
 
-    _, problem, _ = dragged(Wrong(0.5, 4.0, fc.RelativeStiffness(), fc.RelativeStiffness()))
+    _, problem, _ = slipping_block(Wrong(0.5, 4.0, fc.RelativeStiffness(), fc.RelativeStiffness()))
     with pytest.raises(fc.NotConverged, match="friction bound violated by") as caught:
         problem.solve()
     # Smaller increments are no remedy.
@@ -328,7 +332,7 @@ def test_remedies_name_the_stiffnesses_of_the_law():
         (Overclosure(P0, H), "Try smaller increments;"),
         (fc.Coulomb(0.3), "Try smaller increments, a lower k_t, then a lower k_n;"),
     ):
-        _, problem, _ = dragged(law, petsc_options={"snes_max_it": 1})
+        _, problem, _ = slipping_block(law, petsc_options={"snes_max_it": 1})
         with pytest.raises(fc.NotConverged) as caught:
             problem.solve()
         assert words in str(caught.value)
@@ -374,7 +378,7 @@ def test_invalid_parameters_of_a_user_defined_law_are_refused(name, value):
 
 
 @dataclass(frozen=True)
-class Beside(fc.Frictionless):
+class HiddenDependence(fc.Frictionless):
     """A law that depends on something that is not one of its parameters."""
 
     hidden: Any = None
@@ -385,8 +389,8 @@ class Beside(fc.Frictionless):
 
     def contact_traction(self, kinematics, parameters):
         """Return a larger pressure than that of the parameters."""
-        told = super().contact_traction(kinematics, parameters)
-        return replace(told, normal_traction=(1 + self.hidden) * told.normal_traction)
+        traction = super().contact_traction(kinematics, parameters)
+        return replace(traction, normal_traction=(1 + self.hidden) * traction.normal_traction)
 
 
 def test_dependence_on_other_than_parameters_is_refused():
@@ -397,7 +401,7 @@ def test_dependence_on_other_than_parameters_is_refused():
     scene = block("quadrilateral", E=E, nu=NU)
     x = ufl.SpatialCoordinate(scene.mesh)
     for hidden in (x[0], scene.u[0] ** 2, fem.Constant(scene.mesh, 0.1)):
-        law = Beside(k_n=1e3, hidden=hidden)
+        law = HiddenDependence(k_n=1e3, hidden=hidden)
         assert_raised_on_all_ranks(
-            lambda law=law: scene.contact(law), ValueError, "Beside", "parameter"
+            lambda law=law: scene.contact(law), ValueError, "HiddenDependence", "parameter"
         )

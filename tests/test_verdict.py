@@ -18,10 +18,10 @@ COMM = MPI.COMM_WORLD
 class Changed(fc.Coulomb):
     """Coulomb's law with one result that violates it."""
 
-    def __init__(self, what: str) -> None:
-        """Store ``what``, the result to change."""
+    def __init__(self, quantity: str) -> None:
+        """Store ``quantity``, the result to change."""
         super().__init__(0.3, k_n=2e4, k_t=1e4)
-        object.__setattr__(self, "what", what)
+        object.__setattr__(self, "quantity", quantity)
 
     def parameters(self):
         """Return the parameters of Coulomb's law."""
@@ -31,50 +31,50 @@ class Changed(fc.Coulomb):
         """Return the traction of Coulomb's law with one entry changed."""
         r = super().contact_traction(kinematics, parameters)
         parts = {name: getattr(r, name) for name in r.__dataclass_fields__}
-        if self.what == "cone":
+        if self.quantity == "cone":
             parts["traction"] = 1.01 * r.traction
-        elif self.what == "friction bound":
+        elif self.quantity == "friction bound":
             parts["friction_bound"] = 0.99 * r.friction_bound
-        elif self.what == "stiffness":
+        elif self.quantity == "stiffness":
             parts["normal_traction"] = 1.01 * r.normal_traction
-        elif self.what == "adhesion":
+        elif self.quantity == "adhesion":
             parts["normal_traction"] += parameters["k_n"] * positive_part(kinematics.gap)
-        elif self.what == "slip":
+        elif self.quantity == "slip":
             parts["slip"] = tuple(2 * s for s in r.slip)
-        elif self.what == "direction":
+        elif self.quantity == "direction":
             parts["traction"] = -r.traction
         return fc.ContactTraction(**parts)
 
 
 def test_unchanged_law_passes():
     """The same law without a change passes: the failures below are due to the changes."""
-    made = BlockOnBall(Changed("nothing"), method="newton")
-    steps = solve_path(made, path=PATH[:3])
+    setup = BlockOnBall(Changed("nothing"), method="newton")
+    steps = solve_path(setup, path=PATH[:3])
     assert steps[-1].contacts["contact"].slip > 0
     assert not any(s.verdict.failures for s in steps)
 
 
 @pytest.mark.whole
 @pytest.mark.parametrize(
-    "what", ["cone", "friction bound", "stiffness", "adhesion", "slip", "direction"]
+    "quantity", ["cone", "friction bound", "stiffness", "adhesion", "slip", "direction"]
 )
-def test_violated_law_is_detected(what):
+def test_violated_law_is_detected(quantity):
     """Tractions that violate cone, complementarity or flow rule do not pass as a solution."""
-    made = BlockOnBall(Changed(what), method="newton")
-    before = copy_state(made)
+    setup = BlockOnBall(Changed(quantity), method="newton")
+    before = copy_state(setup)
     with pytest.raises(fc.NotConverged) as caught:
-        solve_path(made, path=[PATH[2]])
+        solve_path(setup, path=[PATH[2]])
     failures = "; ".join(caught.value.verdict.failures)
     assert "contact:" in failures, failures
     assert failures in str(caught.value)
-    assert are_identical(copy_state(made), before)
+    assert are_identical(copy_state(setup), before)
 
 
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 @pytest.mark.parametrize("factor", [0.9, 1.0 + 1e-4])
 def test_wrong_contact_residual_is_caught(method, factor, monkeypatch):
     """Forces do not balance if the contact residual is not the integral of the tractions."""
-    made = BlockOnBall(method=method)
+    setup = BlockOnBall(method=method)
     right = fc.ContactOperator.add_force
 
     def wrong(self, residual, traction=None):
@@ -84,17 +84,17 @@ def test_wrong_contact_residual_is_caught(method, factor, monkeypatch):
         before.destroy()
 
     monkeypatch.setattr(fc.ContactOperator, "add_force", wrong)
-    made.set_top_displacement(*PATH[1])
+    setup.set_top_displacement(*PATH[1])
     with pytest.raises(fc.NotConverged) as caught:
-        made.problem.solve()
+        setup.problem.solve()
     assert any("balance" in f for f in caught.value.verdict.failures)
 
 
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_forces_at_wrong_points_are_caught(cell, monkeypatch):
     """Moments do not balance if each force, of the right sum, acts at another point of Γc."""
-    made = BlockOnBall(cell=cell)
-    right, contact = fc.ContactOperator.add_force, made.contact
+    setup = BlockOnBall(cell=cell)
+    right, contact = fc.ContactOperator.add_force, setup.contact
 
     def wrong(self, residual, traction=None):
         contact.evaluate()
@@ -102,9 +102,9 @@ def test_forces_at_wrong_points_are_caught(cell, monkeypatch):
         right(self, residual, np.roll(force, 1, axis=0) / contact.measure[:, None])
 
     monkeypatch.setattr(fc.ContactOperator, "add_force", wrong)
-    made.set_top_displacement(*PATH[1])
+    setup.set_top_displacement(*PATH[1])
     with pytest.raises(fc.NotConverged) as caught:
-        made.problem.solve()
+        setup.problem.solve()
     assert any("moments" in f for f in caught.value.verdict.failures)
 
 
@@ -116,16 +116,16 @@ def test_nodal_forces_agree_with_the_form(factor, condensation):
     The results of the solver, the laws and the sums of forces agree with it within their
     tolerances.
     """
-    made = BlockOnBall(cross_check=True, condensation=condensation)
-    made.contact.pairs.own_map.scale(factor)
-    made.set_top_displacement(*PATH[1])
+    setup = BlockOnBall(cross_check=True, condensation=condensation)
+    setup.contact.pairs.own_map.scale(factor)
+    setup.set_top_displacement(*PATH[1])
     if factor == 1.0:
-        steps = solve_path(made)
+        steps = solve_path(setup)
         assert all(step.verdict.cross_check["contact"].holds() for step in steps)
         assert all(step.verdict.cross_check["contact"].force > 0 for step in steps)
         return
     with pytest.raises(fc.NotConverged) as caught:
-        made.problem.solve()
+        setup.problem.solve()
     assert [f for f in caught.value.verdict.failures if "DOLFINx assembles" in f]
     assert len(caught.value.verdict.failures) == 1
 
@@ -133,22 +133,22 @@ def test_nodal_forces_agree_with_the_form(factor, condensation):
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_premature_convergence_is_caught(method, monkeypatch):
     """Convergence claimed by SNES at its first check is refused; the state is as before."""
-    made = BlockOnBall(method=method, fallback=False)
-    solve_path(made, path=PATH[:1])
-    before = copy_state(made)
-    made.set_top_displacement(*PATH[2])
+    setup = BlockOnBall(method=method, fallback=False)
+    solve_path(setup, path=PATH[:1])
+    before = copy_state(setup)
+    setup.set_top_displacement(*PATH[2])
     claimed = PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
-    monkeypatch.setattr(made.problem.solver.main, "converged", lambda: claimed)
+    monkeypatch.setattr(setup.problem.solver.main, "converged", lambda: claimed)
     with pytest.raises(fc.NotConverged) as caught:
-        made.problem.solve()
+        setup.problem.solve()
     assert any("residual" in f for f in caught.value.verdict.failures)
-    assert are_identical(copy_state(made), before)
+    assert are_identical(copy_state(setup), before)
 
 
 def test_verdict_of_a_solution():
     """A step has its verdict: residual within tolerance, laws to 1e-10, balance of forces."""
-    made = BlockOnBall()
-    for step in solve_path(made):
+    setup = BlockOnBall()
+    for step in solve_path(setup):
         verdict = step.verdict
         assert not verdict.failures
         equation, resultant = verdict.worst_equation, verdict.worst_sum

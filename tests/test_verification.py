@@ -25,9 +25,9 @@ pytestmark = pytest.mark.mpi
 )
 def test_quantities_agree_with_their_references(case):
     """Every quantity of a case is within its tolerance."""
-    made = case.run()
-    missed = [row for row in made.rows if not row.is_met]
-    assert made.rows and not missed, missed
+    case_result = case.run()
+    missed = [row for row in case_result.rows if not row.is_met]
+    assert case_result.rows and not missed, missed
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1.1])
@@ -47,11 +47,11 @@ ONE_PROCESS = pytest.mark.skipif(
 def test_missed_references_and_failed_cases_are_reported(tmp_path, monkeypatch, capsys):
     """Both are reported on the page and by the exit code, and later cases are run."""
 
-    def broken():
+    def failing_case():
         raise RuntimeError("no answer")
 
     rows = {"good": Row("good", 1.0, 1.0, "s", 0.1), "bad": Row("bad", 2.0, 1.0, "s", 0.1)}
-    cases = [Case("Broken", "none", broken)]
+    cases = [Case("Broken", "none", failing_case)]
     cases += [
         Case(name, "none", lambda row=row: Outcome((row,), "a mesh", 7))
         for name, row in rows.items()
@@ -89,9 +89,9 @@ def test_page_is_generated_from_the_stored_values():
 
 def test_error_estimates_of_the_patch_test():
     """The only error of the patch test is the penalty; estimates are exact to first order."""
-    found = list(statics.patch().estimates())
-    assert len(found) == 6
-    for e in found:
+    computed = list(statics.patch().estimates())
+    assert len(computed) == 6
+    for e in computed:
         assert abs(e.estimated + e.true_error) <= 1.1 * e.true_error**2 + 1e-9, e
 
 

@@ -12,9 +12,9 @@ from fenics_contact.wording import format_point, percent
 def test_position_has_six_digits_in_any_unit(unit):
     """The printed numbers differ by at most half of the sixth digit of the largest one."""
     place = unit * np.array([1.2345678, -0.4567891, 1e-12])
-    said = np.array(ast.literal_eval(format_point(place)))
-    assert np.abs(said - place).max() <= 0.5e-5 * unit
-    assert said[2] == 0.0 and np.all(said[:2] != 0.0)
+    coordinates = np.array(ast.literal_eval(format_point(place)))
+    assert np.abs(coordinates - place).max() <= 0.5e-5 * unit
+    assert coordinates[2] == 0.0 and np.all(coordinates[:2] != 0.0)
 
 
 def test_position_at_the_origin_or_not_finite():
@@ -24,9 +24,9 @@ def test_position_at_the_origin_or_not_finite():
 
 
 @pytest.mark.parametrize(
-    ("share", "said"),
+    ("ratio", "text"),
     [(0.0, "0 %"), (1.234e-4, "0.012 %"), (0.7581, "76 %"), (0.996, "100 %"), (12.34, "1234 %")],
 )
-def test_percentages_have_no_exponent(share, said):
+def test_percentages_have_no_exponent(ratio, text):
     """Fractions are printed as percentages without an exponent."""
-    assert percent(share) == said
+    assert percent(ratio) == text

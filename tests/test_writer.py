@@ -57,7 +57,7 @@ def content(grid):
     corners = len(reference(kind))
     x = grid.x[:, :corners]
     d = {3: 1, 5: 2, 9: 2, 10: 3, 12: 3}[kind]
-    at = reference(kind)
+    reference_nodes = reference(kind)
     points = np.array([[0.5 - 0.5 / 3**0.5], [0.5 + 0.5 / 3**0.5]])
     if kind in (5, 10):
         rule = np.full((1, d), 1 / (d + 1))
@@ -68,8 +68,8 @@ def content(grid):
         if kind in (5, 10):
             slopes = np.vstack([-np.ones(d), np.eye(d)])
         else:
-            factors = np.where(at[:, :d] > 0, place, 1 - place)
-            signs = np.where(at[:, :d] > 0, 1.0, -1.0)
+            factors = np.where(reference_nodes[:, :d] > 0, place, 1 - place)
+            signs = np.where(reference_nodes[:, :d] > 0, 1.0, -1.0)
             slopes = np.stack(
                 [signs[:, i] * np.delete(factors, i, axis=1).prod(axis=1) for i in range(d)], axis=1
             )
@@ -87,11 +87,11 @@ def in_plane(values, d):
 def test_cells_nodes_and_fields_are_exact(cell, degree, tmp_path):
     """With shuffled cells, on any number of ranks, all of body and Γc is written exactly once."""
     folder, d = shared_folder(tmp_path), dimension(cell)
-    made = BlockOnBall(cell=cell, degree=degree, mesh={"n": 2, "shuffled": True})
+    setup = BlockOnBall(cell=cell, degree=degree, mesh={"n": 2, "shuffled": True})
     field = polynomial(d, degree, 3, 0.1)
-    made.scene.u.interpolate(field)
-    tensor = stress(made.scene.u, made.scene.E, made.scene.nu)
-    fc.Writer(folder, made.problem, stress=tensor).write(0.5)
+    setup.scene.u.interpolate(field)
+    tensor = stress(setup.scene.u, setup.scene.E, setup.scene.nu)
+    fc.Writer(folder, setup.problem, stress=tensor).write(0.5)
     assert vtu.read_collection(folder / "body.pvd") == [(0.5, "body_0000.vtu")]
 
     body = vtu.read_vtu(folder / "body_0000.vtu")
@@ -102,12 +102,16 @@ def test_cells_nodes_and_fields_are_exact(cell, degree, tmp_path):
     assert np.abs(surface.x[..., d - 1]).max() <= 1e-15
     for grid in (body, surface):
         # Nodes are at their reference coordinates, interpolated from the corners.
-        at, corners = reference(grid.kind), reference(linear_kind(grid.kind))
+        reference_nodes, corners = reference(grid.kind), reference(linear_kind(grid.kind))
         if linear_kind(grid.kind) in (5, 10):
-            weights = np.column_stack([1 - at.sum(axis=1), at[:, : corners.shape[1]]])
+            weights = np.column_stack(
+                [1 - reference_nodes.sum(axis=1), reference_nodes[:, : corners.shape[1]]]
+            )
             weights = weights[:, : len(corners)]
         else:
-            weights = np.where(corners > 0, at[:, None], 1 - at[:, None]).prod(axis=2)
+            weights = np.where(
+                corners > 0, reference_nodes[:, None], 1 - reference_nodes[:, None]
+            ).prod(axis=2)
         places = np.einsum("nk,cki->cni", weights, grid.x[:, : len(corners)])
         assert is_close(grid.x, places, 1e-14)
         exact = field(grid.x.reshape(-1, 3).T).T.reshape(*grid.x.shape[:2], d)
@@ -139,24 +143,24 @@ def test_cells_nodes_and_fields_are_exact(cell, degree, tmp_path):
 def test_values_at_points_and_facets(cell, tmp_path):
     """Points have the contact's values; facets stay within them and preserve the force."""
     folder, d = shared_folder(tmp_path), dimension(cell)
-    made = BlockOnBall(cell=cell, degree=2, mesh={"n": 3})
-    made.problem.small_displacement_tolerance = np.inf
-    writer = fc.Writer(folder, made.problem)
-    for step in fc.increments(made.problem, made.load, 0, 2, steps=2):
+    setup = BlockOnBall(cell=cell, degree=2, mesh={"n": 3})
+    setup.problem.small_displacement_tolerance = np.inf
+    writer = fc.Writer(folder, setup.problem)
+    for step in fc.increments(setup.problem, setup.load, 0, 2, steps=2):
         writer.write(step)
-    contact = made.contact
+    contact = setup.contact
     expected = contact.gather()
     points = vtu.read_vtu(folder / "contact_points_0001.vtu")
     assert points.kind == 1 and points.numbers == {"load": 2.0}
     x = points.x[:, 0]
     order = np.lexsort(np.round(x[:, :d], 9).T[::-1])
     assert is_close(x[order][:, :d], expected["x"], 1e-12)
-    found = {name: values[order, 0] for name, values in points.at_nodes.items()}
+    computed = {name: values[order, 0] for name, values in points.at_nodes.items()}
     for name in ("pressure", "gap", "slip", "status"):
-        assert np.array_equal(found[name], expected[name]), name
+        assert np.array_equal(computed[name], expected[name]), name
     for name in ("normal", "tangential_traction"):
-        assert np.array_equal(found[name][:, :d], expected[name]), name
-    shown = np.unique(found["status"]).tolist()
+        assert np.array_equal(computed[name][:, :d], expected[name]), name
+    shown = np.unique(computed["status"]).tolist()
     assert fc.Status.OPEN in shown and fc.Status.SLIP in shown
 
     facets = vtu.read_vtu(folder / "contact_0001.vtu")
@@ -174,11 +178,11 @@ def test_values_at_points_and_facets(cell, tmp_path):
     middle = points.x[:, 0].reshape(-1, per_facet, 3).mean(axis=1)
     assert is_close(facets.x[:, :corners].mean(axis=1), middle, 1e-12)
     moved = points.at_nodes["displacement"][:, 0]
-    mine = contact.own_displacement()
+    displacements = contact.own_displacement()
     comm = contact.surface.mesh.comm
-    mine = np.concatenate(comm.allgather(np.column_stack([contact.points, mine])))
-    mine = mine[np.lexsort(np.round(mine[:, :d], 9).T[::-1])][:, d:]
-    assert is_close(moved[order][:, :d], mine, 1e-12)
+    displacements = np.concatenate(comm.allgather(np.column_stack([contact.points, displacements])))
+    displacements = displacements[np.lexsort(np.round(displacements[:, :d], 9).T[::-1])][:, d:]
+    assert is_close(moved[order][:, :d], displacements, 1e-12)
 
 
 def test_facet_values_stay_within_point_values():
@@ -191,12 +195,12 @@ def test_facet_values_stay_within_point_values():
     ends = np.array([[0.0, 0.0], [1.0, 2.0]])[None].repeat(200, axis=0)
     values = rng.uniform(-1, 1, (200, 3, 2)) ** 3
     values[0] = [[0.0, 1], [0.0, 2], [1000.0, 3]]
-    found = facet_values(points, measure, values, ends)
-    assert np.all(found >= values.min(axis=1, keepdims=True))
-    assert np.all(found <= values.max(axis=1, keepdims=True))
-    assert is_close(found.mean(axis=1), np.einsum("p,fpk->fk", weights, values), 1e-13)
-    assert found[0, 0, 0] == 0.0  # a linear fit gives -368 here
-    assert is_close(found[0, :, 1], [1.0, 3.0], 1e-13)  # increases along the whole facet
+    computed = facet_values(points, measure, values, ends)
+    assert np.all(computed >= values.min(axis=1, keepdims=True))
+    assert np.all(computed <= values.max(axis=1, keepdims=True))
+    assert is_close(computed.mean(axis=1), np.einsum("p,fpk->fk", weights, values), 1e-13)
+    assert computed[0, 0, 0] == 0.0  # a linear fit gives -368 here
+    assert is_close(computed[0, :, 1], [1.0, 3.0], 1e-13)  # increases along the whole facet
     # Linear fields are exact at the points.
     line = 3 - 2 * points[:, :, 0] + points[:, :, 1] ** 0
     assert is_close(facet_values(points, measure, line, points), line, 1e-13)
@@ -204,19 +208,19 @@ def test_facet_values_stay_within_point_values():
     one = facet_values(points[:1, :1], measure[:1, :1], np.array([[7.0]]), ends[:1])
     assert one.tolist() == [[7.0, 7.0]]
     holes = np.array([[np.nan, 2.0, 4.0], [np.nan] * 3])
-    found = facet_values(points[:2], measure[:2], holes, ends[:2])
-    assert found[0] == pytest.approx((8 * 2 + 5 * 4) / 13) and np.isnan(found[1]).all()
+    computed = facet_values(points[:2], measure[:2], holes, ends[:2])
+    assert computed[0] == pytest.approx((8 * 2 + 5 * 4) / 13) and np.isnan(computed[1]).all()
     assert facet_values(points[:0], measure[:0], values[:0], ends[:0]).shape == (0, 2, 2)
 
 
 def files(folder):
     COMM.barrier()
-    found = {name: (folder / name).read_bytes() for name in sorted(os.listdir(folder))}
+    contents = {name: (folder / name).read_bytes() for name in sorted(os.listdir(folder))}
     COMM.barrier()
-    return found
+    return contents
 
 
-def written(folder, name="floor"):
+def read_series(folder, name="floor"):
     """Return times, loads and largest pressures of a series."""
     states = [
         (time, vtu.read_vtu(folder / file))
@@ -228,31 +232,34 @@ def written(folder, name="floor"):
 def test_resumed_history_continues_the_series(tmp_path):
     """No state is written twice or lost, and the files of earlier increments are unchanged."""
     folder = shared_folder(tmp_path)
-    whole, made = BlockOnBallHistory(), BlockOnBallHistory()
-    writer = fc.Writer(folder / "whole", whole.problem)
-    for step in whole.increments(4.0):  # load and unload: loads occur twice, increments once
+    uninterrupted, setup = BlockOnBallHistory(), BlockOnBallHistory()
+    writer = fc.Writer(folder / "whole", uninterrupted.problem)
+    # Load and unload: loads occur twice, increments once.
+    for step in uninterrupted.increments(4.0):
         writer.write(step)
-    writer = fc.Writer(folder / "parts", made.problem)
-    for step in made.increments(4.0, checkpoint=folder / "state.npz", checkpoint_every=2):
+    writer = fc.Writer(folder / "parts", setup.problem)
+    for step in setup.increments(4.0, checkpoint=folder / "state.npz", checkpoint_every=2):
         writer.write(step)
         if step.increment == 5:  # one after the checkpoint, at increment 4
             break
     before = files(folder / "parts")
-    again = BlockOnBallHistory()
-    writer = fc.Writer(folder / "parts", again.problem)
+    resumed = BlockOnBallHistory()
+    writer = fc.Writer(folder / "parts", resumed.problem)
     assert files(folder / "parts") == before
-    for step in again.increments(4.0, checkpoint=folder / "state.npz"):
+    for step in resumed.increments(4.0, checkpoint=folder / "state.npz"):
         if step.increment == 5:
-            assert [time for time, *_ in written(folder / "parts")] == [1, 2, 3, 4, 5]
+            assert [time for time, *_ in read_series(folder / "parts")] == [1, 2, 3, 4, 5]
         writer.write(step)
-    after, expected = written(folder / "parts"), written(folder / "whole")
+    after, expected = read_series(folder / "parts"), read_series(folder / "whole")
     assert [row[:2] for row in after] == [row[:2] for row in expected]
     assert [row[0] for row in after] == [*range(1, 9)]
-    assert is_close([row[2] for row in after], [row[2] for row in expected], whole.tolerance)
-    kept = [n for n in before if n.endswith(".vtu") and int(n[-8:-4]) < 4]
-    assert len(kept) == 16
+    assert is_close(
+        [row[2] for row in after], [row[2] for row in expected], uninterrupted.tolerance
+    )
+    unchanged = [n for n in before if n.endswith(".vtu") and int(n[-8:-4]) < 4]
+    assert len(unchanged) == 16
     now = files(folder / "parts")
-    assert all(now[name] == before[name] for name in kept)
+    assert all(now[name] == before[name] for name in unchanged)
 
     # The first state of a new history replaces the series.
     fresh = BlockOnBallHistory()
@@ -269,27 +276,29 @@ def test_resumed_history_continues_the_series(tmp_path):
 def test_invalid_input_is_refused(tmp_path):
     """Errors on all ranks state the remedy; nothing is written."""
     folder = shared_folder(tmp_path)
-    made = BlockOnBall()
+    setup = BlockOnBall()
     (folder / "file").touch()
     COMM.barrier()
     named = f"but {folder / 'file'} is a file; give another name"
     for taken in (folder / "file", folder / "file" / "in"):
         assert_raised_on_all_ranks(
-            lambda taken=taken: fc.Writer(taken, made.problem), (OSError, NotADirectoryError), named
+            lambda taken=taken: fc.Writer(taken, setup.problem),
+            (OSError, NotADirectoryError),
+            named,
         )
     assert_raised_on_all_ranks(
-        lambda: fc.Writer(folder, made.contact), ValueError, "ContactProblem"
+        lambda: fc.Writer(folder, setup.contact), ValueError, "ContactProblem"
     )
-    vector = made.scene.u
+    vector = setup.scene.u
     assert_raised_on_all_ranks(
-        lambda: fc.Writer(folder, made.problem, stress=vector), ValueError, "(2,)", "(3, 3)"
+        lambda: fc.Writer(folder, setup.problem, stress=vector), ValueError, "(2,)", "(3, 3)"
     )
     odd = BlockOnBall(contact={"name": "a/b"})
     assert_raised_on_all_ranks(lambda: fc.Writer(folder, odd.problem), ValueError, "a/b", "name")
     odd = BlockOnBall(contact={"name": "body"})
     assert_raised_on_all_ranks(lambda: fc.Writer(folder, odd.problem), ValueError, "body.pvd")
     assert sorted(files(folder)) == ["file"]
-    writer = fc.Writer(folder, made.problem)
+    writer = fc.Writer(folder, setup.problem)
     for state in (None, "1", float("nan"), True):
         assert_raised_on_all_ranks(lambda state=state: writer.write(state), ValueError, "time")
     writer.write(1)
@@ -298,15 +307,15 @@ def test_invalid_input_is_refused(tmp_path):
         (folder / "contact.pvd").write_text("<broken")
     COMM.barrier()
     assert_raised_on_all_ranks(
-        lambda: fc.Writer(folder, made.problem), ValueError, "contact.pvd", "remove"
+        lambda: fc.Writer(folder, setup.problem), ValueError, "contact.pvd", "remove"
     )
 
 
 def test_second_writer_in_a_folder_is_refused(tmp_path):
     """A second writer would overwrite files that are listed in the series of the first one."""
     folder = shared_folder(tmp_path)
-    made = BlockOnBall()
-    first, second = (fc.Writer(folder, made.problem) for _ in range(2))
+    setup = BlockOnBall()
+    first, second = (fc.Writer(folder, setup.problem) for _ in range(2))
     first.write(1)
     before = files(folder)
     assert_raised_on_all_ranks(
@@ -314,7 +323,7 @@ def test_second_writer_in_a_folder_is_refused(tmp_path):
     )
     assert files(folder) == before
     first.write(2)
-    fc.Writer(folder, made.problem).write(3)  # replaces the first writer
+    fc.Writer(folder, setup.problem).write(3)  # replaces the first writer
     assert_raised_on_all_ranks(lambda: first.write(4), ValueError, "one Writer per folder")
     assert [time for time, _ in vtu.read_collection(folder / "body.pvd")] == [1, 2, 3]
 
@@ -322,17 +331,17 @@ def test_second_writer_in_a_folder_is_refused(tmp_path):
 def test_failed_write_leaves_the_series_unchanged(tmp_path, monkeypatch):
     """After a failed write the series is unchanged, and the next write continues it."""
     folder = shared_folder(tmp_path)
-    made = BlockOnBall()
-    writer = fc.Writer(folder, made.problem)
+    setup = BlockOnBall()
+    writer = fc.Writer(folder, setup.problem)
     writer.write(1)
     before = files(folder)
     replace, calls = os.replace, []
 
-    def full(*names):
+    def fail_to_write(*names):
         raise OSError("no space left")
 
     with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", full)
+        patch.setattr(os, "replace", fail_to_write)
         assert_raised_on_all_ranks(lambda: writer.write(2), OSError, "no space left")
     assert files(folder) == before and not calls and os.replace is replace
     writer.write(2)
@@ -345,10 +354,10 @@ def test_interior_displacement_is_recovered_before_writing(tmp_path):
     folder = shared_folder(tmp_path)
     grids = []
     for name, field in (("every", "every"), ("last", "last")):
-        made = BlockOnBall(condensation=True)
-        made.problem.small_displacement_tolerance = np.inf
-        writer = fc.Writer(folder / name, made.problem)
-        for step in fc.increments(made.problem, made.load, 0, 1, steps=2, recover_interior=field):
+        setup = BlockOnBall(condensation=True)
+        setup.problem.small_displacement_tolerance = np.inf
+        writer = fc.Writer(folder / name, setup.problem)
+        for step in fc.increments(setup.problem, setup.load, 0, 1, steps=2, recover_interior=field):
             if step.increment == 1:
                 assert step.complete == (field == "every")
                 writer.write(step)
@@ -361,12 +370,12 @@ def test_interior_displacement_is_recovered_before_writing(tmp_path):
 def test_true_and_nominal_pressure_with_finite_kinematics(cell, tmp_path):
     """The true pressure is the nominal one divided by the area stretch of Γc, to 1e-12."""
     folder = shared_folder(tmp_path)
-    made = DiscOnRubber(cell)
-    writer = fc.Writer(folder, made.problem, stress=made.scene.body.stress)
-    for step in made.increments(1.0, steps=2):
+    setup = DiscOnRubber(cell)
+    writer = fc.Writer(folder, setup.problem, stress=setup.scene.body.stress)
+    for step in setup.increments(1.0, steps=2):
         writer.write(step)
     points = vtu.read_vtu(folder / "contact_points_0001.vtu").at_nodes
-    contact = made.contact
+    contact = setup.contact
     stretch = np.concatenate(COMM.allgather(contact.area_stretch()))
     pressure = np.concatenate(COMM.allgather(contact.pressure))
     closed = pressure > 0
@@ -381,10 +390,10 @@ def test_true_and_nominal_pressure_with_finite_kinematics(cell, tmp_path):
 def test_stress_on_the_axis_of_symmetry(tmp_path):
     """Where u_r/r is 0/0 the stress is extrapolated from points inside the cells, to 1e-10."""
     folder = shared_folder(tmp_path)
-    made = BlockOnBall(degree=2)
-    body = fc.elasticity.LinearElastic(made.scene.u, 1000.0, 0.3, "axisymmetric")
-    made.scene.u.interpolate(lambda x: np.vstack([1e-3 * x[0], 0 * x[0]]))
-    fc.Writer(folder, made.problem, stress=body.stress).write(0)
+    setup = BlockOnBall(degree=2)
+    body = fc.elasticity.LinearElastic(setup.scene.u, 1000.0, 0.3, "axisymmetric")
+    setup.scene.u.interpolate(lambda x: np.vstack([1e-3 * x[0], 0 * x[0]]))
+    fc.Writer(folder, setup.problem, stress=body.stress).write(0)
     grid = vtu.read_vtu(folder / "body_0000.vtu")
     assert np.any(grid.x[..., 0] == 0)
     lame, shear = 1000 * 0.3 / 1.3 / 0.4, 1000 / 2.6
@@ -395,9 +404,9 @@ def test_stress_on_the_axis_of_symmetry(tmp_path):
 def test_mixed_function_writes_its_displacement(tmp_path):
     """The displacement of the mixed function is written, equal on the body and on Γc to 1e-12."""
     folder = shared_folder(tmp_path)
-    made = DiscOnRubber(mixed="Taylor-Hood", nu=0.5, law=fc.Frictionless(1e4))
-    writer = fc.Writer(folder, made.problem, stress=made.scene.body.stress)
-    for step in made.increments(0.5, steps=1):
+    setup = DiscOnRubber(mixed="Taylor-Hood", nu=0.5, law=fc.Frictionless(1e4))
+    writer = fc.Writer(folder, setup.problem, stress=setup.scene.body.stress)
+    for step in setup.increments(0.5, steps=1):
         writer.write(step)
     body, top = (vtu.read_vtu(folder / f"{n}_0000.vtu") for n in ("body", "contact"))
     places = {tuple(x): u for x, u in zip(*flat(body), strict=True)}
@@ -405,7 +414,7 @@ def test_mixed_function_writes_its_displacement(tmp_path):
         np.allclose(places[tuple(x)], u, atol=1e-12) for x, u in zip(*flat(top), strict=True)
     )
     assert np.abs(top.at_nodes["displacement"]).max() > 0.01
-    assert ufl.as_ufl(made.scene.displacement).ufl_shape == (2,)
+    assert ufl.as_ufl(setup.scene.displacement).ufl_shape == (2,)
 
 
 def flat(grid):

@@ -35,7 +35,7 @@ def ring(n, inside, outside, degree=1):
     return mesh, None, tags
 
 
-def pressed(n, law, *, side=-1.0, degree=1, **options):
+def pressure_ratio_and_scatter(n, law, *, side=-1.0, degree=1, **options):
     """Return mean interface pressure relative to Lamé's, and its coefficient of variation.
 
     Args:
@@ -77,10 +77,10 @@ def test_touching_rings_with_and_without_zero_gap(n):
     with Γc on the finer one, at its facets near corners of the coarser; without ``gap=0`` by more
     than 150 %.
     """
-    mean, scatter = pressed(n, fc.Frictionless(), gap=0)
+    mean, scatter = pressure_ratio_and_scatter(n, fc.Frictionless(), gap=0)
     assert mean == pytest.approx(1.0, abs=5e-3)
     assert scatter < (0.01 if n[0] < n[1] else 0.2)
-    mean, scatter = pressed(n, fc.Frictionless())
+    mean, scatter = pressure_ratio_and_scatter(n, fc.Frictionless())
     assert abs(mean - 1.0) > 0.2 and scatter > 1.5
 
 
@@ -93,18 +93,18 @@ def test_pressure_scatter_is_due_to_faceting(factor):
     quadratic cells and displacements it is below 1e-3.
     """
     law = fc.Frictionless(k_n=fc.RelativeStiffness(factor))
-    _, scatter = pressed((20, 13), law, gap=0)
+    _, scatter = pressure_ratio_and_scatter((20, 13), law, gap=0)
     assert scatter == pytest.approx(0.02 * factor, rel=0.1)
-    _, finer = pressed((40, 26), law, gap=0)
+    _, finer = pressure_ratio_and_scatter((40, 26), law, gap=0)
     assert finer == pytest.approx(scatter / 4, rel=0.1)
     for n in ((13, 20), (20, 13)):
-        mean, scatter = pressed(n, law, gap=0, degree=2)
+        mean, scatter = pressure_ratio_and_scatter(n, law, gap=0, degree=2)
         assert scatter < 1e-3 and mean == pytest.approx(1.0, abs=2e-2 / factor)
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_tied_rings_agree_with_one_ring(side):
     """Pressed or pulled, rings tied by 10 E/h with ``gap=0`` agree to 0.5 %, scatter below 1 %."""
-    mean, scatter = pressed((13, 20), TIE, side=side, gap=0)
+    mean, scatter = pressure_ratio_and_scatter((13, 20), TIE, side=side, gap=0)
     assert mean == pytest.approx(1.0, abs=5e-3)
     assert abs(scatter) < 0.01
