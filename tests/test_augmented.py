@@ -448,11 +448,11 @@ def test_restart_from_checkpoint_with_multipliers(tmp_path: Path) -> None:
     """
     folder = shared_folder(tmp_path)
     tractions = []
-    for take_up in (False, True):
+    for resumes in (False, True):
         scene = block("triangle", 2, n=3, up=-10.0)
         law = fc.Coulomb(0.3, k_n=1e4, k_t=1e4)
         problem, contact = scene.problem(law, [], contact=AUGMENTED)
-        if take_up:
+        if resumes:
             scene.load(up=-10.0, side=1.0)
             checkpoint.load(problem, folder / "state.npz")
         else:
