@@ -27,8 +27,10 @@ CAMPAIGNS = {
     "the same, later": ("campaign_mixed_later.csv", "1"),
     "the same, latest": ("campaign_mixed_latest.csv", "1"),
     "finite kinematics, rigid obstacles": ("campaign_finite.csv", "1"),
+    "finite kinematics, rigid obstacles, later": ("campaign_finite_later.csv", "1"),
     "finite kinematics, two bodies": ("campaign_bodies.csv", "1"),
-    "the same, dissimilar bodies": ("campaign_unlike.csv", "1"),
+    "finite kinematics, two bodies, later": ("campaign_bodies_later.csv", "1"),
+    "finite kinematics, dissimilar bodies": ("campaign_unlike.csv", "1"),
 }
 # Labels and colours of the outcomes on the page, by their names in the files.
 OUTCOMES = {
@@ -71,7 +73,7 @@ def page(rows_by_campaign: dict[str, list[Row]]) -> str:
     )
     lines = ["# Random scenes", ""]
     lines += report.text(
-        f"**{wrong} of {total} random scenes had a wrong result when they were run**, of which 4 "
+        f"**{wrong} of {total} random scenes had a wrong result when they were run**, of which 6 "
         "are not explained ([below](#wrong-results)). Every scene is solved by the package and by "
         f"an independent solver, {increments:,} increments in all; 1748 scenes that were run "
         "before are not in the table."
@@ -159,6 +161,9 @@ def page(rows_by_campaign: dict[str, list[Row]]) -> str:
         "- Not explained, besides the first, are a penetration with multipliers 10 % above the "
         "tolerance, on a single facet (815746), and a slip reference 1e-4 of the body's size "
         "inside the obstacle, a plate that slides past the body (815922).",
+        "- Two of the later scenes of two bodies with finite kinematics (1400, 1424, families of "
+        "24) are not explained: a surface penetrates between the points of the other, by 0.23 and "
+        "0.21 facets of Γc more than at the points; the comparison permits 0.2.",
         "- Errors detected earlier by scenes of two bodies are corrected and tested: a resumed "
         "history refused because of the round-off of a prescribed zero, a NumPy error for a "
         "flattened surface, a residual of 5e-7 of a soft body's forces taken as the round-off of "
@@ -187,6 +192,10 @@ def page(rows_by_campaign: dict[str, list[Row]]) -> str:
         "between its points.",
         "- First mixed scenes: 82 did not converge and were solved by the independent solver; 69 "
         "refusals are required by the geometry.",
+        "- Finite kinematics, rigid obstacles, later (families of 12): all 23 refused scenes are "
+        "solved by the independent solver, which has the same quadrature points. In 21 the "
+        "obstacle penetrates Γc between them, in two Γc crosses the obstacle in one increment; 17 "
+        "of the 23 are blocks inside a cylinder or a ball.",
         "- Dissimilar bodies: in 13 of 18 refusals the opposing surface penetrates Γc between its "
         "points; in 12 of these Γc is a single facet.",
     )
