@@ -332,7 +332,7 @@ class ContactProblem:
             self._complete_all()  # before its factors are discarded
         self.solver.equations.factorisations = 0
         start_unknowns = self.full.state()
-        # After a failure its values would accept any residual.
+        # A failed iteration may leave a diagonal whose round-off would accept any residual.
         diagonal = None if self.full.bulk.linear else self.full.diagonal
         at_present = self._is_present(start_unknowns)
         self._restore_committed_pairs()

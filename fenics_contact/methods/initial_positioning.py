@@ -198,13 +198,13 @@ class InitialPositioning:
     def _at_points(self, modes: Index) -> list[Array]:
         """Return jumps of free modes by contact, (n_modes, n_points, gdim). Collective."""
         motions = self.motions
-        jumps = motions.jumps_at_points(self.full.operators, motions.present_matrix())
+        jumps = motions.present_jumps(self.full.operators, motions.present_matrix())
         return [by_mode[modes] for by_mode in jumps]
 
     def _find_free_modes(self, modes: Index) -> _FreeModes | None:
         """Evaluate the free modes; None if they are unloaded. Collective."""
         motions, contacts = self.motions, self.full.contacts
-        matrix, free = motions.present_matrix(), motions.free[modes]
+        matrix = motions.present_matrix()
         load = motions.work_of_load(self.load, matrix)[modes]
         largest = np.abs(load).max()
         if not largest > 0:
@@ -212,10 +212,11 @@ class InitialPositioning:
         jumps = [
             contact.contact_kinematics.rotate_to_displaced(by_mode[modes])
             for contact, by_mode in zip(
-                contacts, motions.jumps_at_points(self.full.operators, matrix), strict=True
+                contacts, motions.present_jumps(self.full.operators, matrix), strict=True
             )
         ]
-        return _FreeModes(modes, load / largest, free @ motions.gram(matrix) @ free.T, jumps)
+        gram = motions.present_gram(matrix)[np.ix_(modes, modes)]
+        return _FreeModes(modes, load / largest, gram, jumps)
 
     def _displace(self, modes: Index, coefficients: Array) -> None:
         """Displace bodies by free modes with these coefficients. Collective."""

@@ -43,18 +43,18 @@ def find_least_motion(
     Args:
         full: The system, at the state to change.
         motions: The rigid-body modes.
-        modes: Modes that may change, in free modes, (n_modes, n_free).
+        modes: Modes that may change, combinations of the free modes, (n_modes, n_free).
         states: Values at the points of every contact at that state.
-        displacement: Motion since the reference state, in free modes, (n_free,) (length).
+        displacement: Amplitudes of the free modes since the reference state, (n_free,) (length).
         among: Masks of the points that count, (n_points,) each.
         closed: Reduction of the gaps since ``states``, (n_points,) each (length).
 
     Returns:
-        Change in free modes, (n_free,) (length); None if the constraints are infeasible.
+        Change of these amplitudes, (n_free,) (length); None if the constraints are infeasible.
     """
     comm, scales = full.unknowns.comm, full.scales
     matrix = motions.present_matrix()
-    at_points = motions.jumps_at_points(full.operators, matrix)
+    at_points = motions.present_jumps(full.operators, matrix)
     rows = [np.zeros((0, len(modes) + 1))]
     closed = closed or [np.zeros(len(values.gap)) for values in states]
     points = zip(full.operators, at_points, states, among, closed, strict=True)
@@ -71,7 +71,7 @@ def find_least_motion(
         limit = np.where(is_touching, 0.0, gap - NEGLIGIBLE * size)
         rows.append(np.column_stack([closing, limit])[is_coupled])
     limits = gather_rows(comm, np.concatenate(rows))
-    mass = motions.free @ motions.gram(matrix) @ motions.free.T
+    mass = motions.present_gram(matrix)
     rotations = motions.free * (motions.rotation_length > 0.0)
     norm = modes @ (mass + _ROTATION_WEIGHT * mass.max() * rotations @ rotations.T)
     change = minimise_norm(norm @ modes.T, norm @ displacement, limits[:, :-1], limits[:, -1])

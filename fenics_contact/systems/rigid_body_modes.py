@@ -121,7 +121,7 @@ class RigidBodyModes(RigidMotions):
         """Return the free modes at the present positions, (n_free, n_local)."""
         return np.asarray((self.present_matrix().T @ self.free.T).T)
 
-    def jumps_at_points(
+    def present_jumps(
         self, operators: Sequence[ContactOperator], matrix: scipy.sparse.csc_matrix
     ) -> list[Array]:
         """Return the jumps of the free modes by contact, (n_free, n_points, gdim). Collective.
@@ -133,6 +133,10 @@ class RigidBodyModes(RigidMotions):
         shape = len(self.free), -1, self._x.shape[1]
         fields = [matrix.T @ row for row in self.free]
         return [np.array([o.jump(field) for field in fields]).reshape(shape) for o in operators]
+
+    def present_gram(self, matrix: scipy.sparse.csc_matrix) -> Array:
+        """Return the products of free modes of a `present_matrix`, (n_free, n_free). Collective."""
+        return np.asarray(self.free @ self.gram(matrix) @ self.free.T)
 
     def work_of_load(self, load: Array, matrix: scipy.sparse.csc_matrix) -> Array:
         """Return the work of a load on the free modes, 0 where it is round-off. Collective.
@@ -239,7 +243,7 @@ class RigidBodyModes(RigidMotions):
         gram: Array = np.zeros((n, n))
         area: Array = np.zeros(n)
         unknown: Array = np.zeros(scales.n_groups)
-        at_points = self.jumps_at_points(operators, self.present_matrix())
+        at_points = self.present_jumps(operators, self.present_matrix())
         for number, (operator, modes) in enumerate(zip(operators, at_points, strict=True)):
             contact, weights = operator.contact, operator.contact.quadrature.weights
             has_jump = np.abs(modes).max(axis=2, initial=0.0) > NEGLIGIBLE
