@@ -582,3 +582,34 @@ def test_true_gap_of_a_rotated_block(cell):
     height = (x + moved(x.T).T)[:, -1] - 0.5
     assert is_close(gap, height / np.cos(angle), 1e-12, scale=1.0)
     assert COMM.allreduce(np.abs(contact.gap - gap).max(initial=0.0), op=MPI.MAX) > 1e-3
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
+def test_projection_is_exact_in_rotated_bodies(cell):
+    """A facet of the block, rotated by 0.3 and lifted, is above two facets of the other one.
+
+    Their common node rises by 1. Projected onto linear functions of the facet, the displacement of
+    the opposite points is its mean, 1 - cos(0.3) / 3, to round-off (1e-12).
+    """
+    body = stack(cell, (4, 1), (0.5, 1.0), widths=[3.0, 1.0])
+    contact = joint(body, 1, fc.Frictionless(1e6), quadrature=2)
+    d, angle, arm = body.d, 0.3, 0.75
+
+    def rotated(x):
+        along, up = x[0] - 0.5, x[d - 1] - 0.5
+        cosine, sine = np.cos(angle) - 1, np.sin(angle)
+        across = [0 * along] * (d - 2)
+        return np.vstack([cosine * along - sine * up, *across, sine * along + cosine * up + 0.25])
+
+    def raised(x):
+        return np.vstack([*([0 * x[0]] * (d - 1)), np.maximum(1 - abs(x[0] - 0.5) / arm, 0)])
+
+    body.set_displacement(rotated, lambda x: x[:, -1] > 0.5)
+    contact.contact_kinematics.find_pairs(body.u, np.zeros(len(contact.points)))
+    body.u.x.array[:] = 0.0
+    contact.evaluate()
+    before = contact.gap.copy()
+    body.set_displacement(raised, lambda x: x[:, -1] < 0.51)
+    contact.evaluate()
+    exact = np.full(len(before), 1 - np.cos(angle) / 4 / arm)
+    assert is_close(before - contact.gap, exact, 1e-12)

@@ -375,9 +375,9 @@ def _cut_quadrature(
     if slave.d == 2:
         quadrature, shares = basix.make_quadrature(basix.CellType.interval, 12)
         origin, edge = corners[0], corners[1] - corners[0]
-        covered = 0.0
+        across, covered = edge - (edge @ mean) * mean, 0.0
         for other in others[facing]:
-            ends = np.clip((other - origin) @ edge / (edge @ edge), 0, 1)
+            ends = np.clip((other - origin) @ across / (across @ across), 0, 1)
             low, high = ends.min(), ends.max()
             if high - low > 1e-9:
                 covered += high - low

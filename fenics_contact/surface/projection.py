@@ -64,12 +64,16 @@ def find_near_pairs(tree: scipy.spatial.cKDTree, centre: Array, reach: Array) ->
 def cut_lines(
     slave: Array, normal: Array, master: Array, pairs: tuple[Any, Any], degree: int
 ) -> tuple[Any, Any, Array, Array, Array]:
-    """Cut slave facets at the ends of master facets in 2D."""
+    """Cut slave facets at the ends of master facets in 2D, along the normals of the former.
+
+    If the bodies are displaced, these need not be orthogonal to the facets.
+    """
     rule, weights = basix.make_quadrature(basix.CellType.interval, degree)
     first, second = pairs
     origin, edge = slave[:, 0], slave[:, 1] - slave[:, 0]
-    ends = np.einsum("pkd,pd->pk", master[second] - origin[first][:, None], edge[first])
-    ends = (ends / np.einsum("fd,fd->f", edge, edge)[first][:, None]).clip(0, 1)
+    across = edge - np.einsum("fd,fd->f", edge, normal)[:, None] * normal
+    ends = np.einsum("pkd,pd->pk", master[second] - origin[first][:, None], across[first])
+    ends = (ends / np.einsum("fd,fd->f", across, across)[first][:, None]).clip(0, 1)
     low, size = ends.min(axis=1), ends.max(axis=1) - ends.min(axis=1)
     size = np.where(size > NEGLIGIBLE, size, 0.0)
     covered = np.bincount(first, size, len(slave)) >= 1 - FLAT
