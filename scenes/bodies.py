@@ -165,3 +165,17 @@ class Bodies:
         """
         self.u.interpolate(field, cells0=self.cells(where))
         self.u.x.scatter_forward()
+
+    def reaction(self, tag: int) -> Array:
+        """Return the reaction of the Dirichlet condition on a side, (d,) (force). Collective.
+
+        It is assembled from the form, which has no contact forces.
+        """
+        space = self.u.function_space
+        residual = fem.Function(space)
+        fem.assemble_vector(residual.x.array, fem.form(self.F))
+        residual.x.scatter_reverse(dolfinx.la.InsertMode.add)
+        nodes = fem.locate_dofs_topological(space, self.d - 1, self.tags.find(tag))
+        nodes = nodes[nodes < space.dofmap.index_map.size_local]
+        forces = residual.x.array.reshape(-1, self.d)[nodes]
+        return np.asarray(space.mesh.comm.allreduce(forces.sum(axis=0)))

@@ -336,6 +336,56 @@ def test_sliding_past_a_thin_tip_is_not_tunnelling(half):
     assert forces[0] == pytest.approx(forces[1], rel=1e-6, abs=1e-9 * E)
 
 
+def test_corners_in_a_cavity_are_accepted_as_the_points_predict():
+    """A block is lowered into a cavity that fits its lower corners, without friction.
+
+    At first the corners penetrate by 10 % of the facets, which the curved wall explains, and no
+    point is in contact. Then points are, and the force balances the reaction, to 1e-7.
+    """
+    body = block(n=(2, 1))
+    down = body.constant(0.0)
+    body.prescribe(TOP, 0)
+    body.prescribe(TOP, 1, value=down)
+    centre = np.array([0.5, 0.374])
+    wall = fc.Ball(centre, np.linalg.norm(centre), inside=True)
+    contact = body.contact(BOTTOM, wall, fc.Frictionless(), kinematics="finite", quadrature=2)
+    problem = body.problem(contact)
+    down.value = -0.08
+    problem.solve()
+    problem.commit()
+    corner = np.linalg.norm(np.array([0.0, -0.08]) - centre) - np.linalg.norm(centre)
+    assert corner > 0.1 * 0.45
+    assert contact.resultants().normal_force == 0.0
+    down.value = -0.15
+    problem.solve()
+    force = contact.resultants().force[1]
+    assert force > 0.0
+    assert -body.reaction(TOP)[1] == pytest.approx(force, rel=1e-7)
+
+
+@KINEMATICS
+def test_slanted_plate_does_not_pass_through_a_corner(kinematics):
+    """A plate, 0.02 thick, moves up by 0.018 where vertex quadrature has a point, at a corner.
+
+    The corner ends in the upper half of the plate, which would press it out on the wrong side.
+    """
+    body = block(n=(3, 3))
+    up = body.constant(np.zeros(2))
+    body.prescribe(TOP, 0, 1)
+
+    def slanted(x):
+        along = ufl.max_value(0.1, ufl.min_value(1.3, x[0]))
+        height = x[1] + 0.026 - 0.05 * (along - 0.7)
+        return ufl.sqrt((x[0] - along) ** 2 + height**2) - 0.01
+
+    obstacle = fc.SignedDistance(slanted, displacement=up)
+    surface = fc.ContactSurface(body.mesh, body.tags, BOTTOM, quadrature_scheme="vertex")
+    contact = fc.Contact(body.u, surface, obstacle, fc.Frictionless(), kinematics=kinematics)
+    problem = body.problem(contact)
+    up.value[1] = 0.018
+    assert_increment_refused(problem, "has crossed")
+
+
 @KINEMATICS
 @pytest.mark.parametrize("sides", [(BOTTOM,), (BOTTOM, SIDES)])
 def test_blade_does_not_pass_sideways_through_a_body(kinematics, sides):

@@ -9,9 +9,9 @@ from fenics_contact.checks.penetration import (
     OPPOSITE_SIDES,
     ResistedDepth,
     allowed_depth,
-    depth_below,
     dot,
-    tangent_planes_around,
+    gather_around,
+    predicted_depth,
 )
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
@@ -74,7 +74,7 @@ class OpposingBodyProbe:
             (slave.corners[slave.own], resisted[self._rows].max(axis=1, initial=0.0)),
             (master.corners[partner[paired]], resisted[paired]),
         ]
-        self._planes = self._tangent_planes(resisted)
+        self._around = self._gather_points(resisted)
         # Facets beside the normals may be nearer than the hits; those beyond the `nearby` ones are
         # at least a height away.
         depth, allowed = self.depth(ResistedDepth.of(self._comm, [], []))
@@ -124,27 +124,32 @@ class OpposingBodyProbe:
         size, other = slave.side.length[on_slave] / edges, master.side.length[on_master] / edges
         faceting = slave.side.faceting[on_slave] + master.side.faceting[on_master]
         paired = ~np.isnan(np.concatenate([self._slave_hits.distance, hits.distance]))
-        # For positions of the master surface, the planes at their projections onto Γc.
+        # For positions of the master surface, the prediction is that at their projections onto Γc.
         projection = master.place + np.nan_to_num(hits.distance)[:, None] * master.normal
         positions = np.concatenate([slave.place, projection])
-        planes = depth_below(positions, *(p[on_slave] for p in self._planes))
-        planes[on_slave < 0] = -np.inf
+        normals = np.concatenate([_opposite_normals(self._slave_hits, slave), master.normal])
+        points = (field[on_slave] for field in self._around)
+        predicted = predicted_depth(positions, normals, *points)
+        for depth in predicted:
+            depth[on_slave < 0] = -np.inf
         smaller = np.where(paired, np.minimum(size, other), np.where(on_slave >= 0, size, other))
-        allowed = allowed_depth(around, planes, size, smaller) + np.where(paired, faceting, 0.0)
-        depth = np.concatenate([_depth(self._slave_hits, slave), _depth(hits, master)])
-        return np.where(paired, depth, 0.0), allowed
+        allowed = allowed_depth(around, predicted, size, smaller) + np.where(paired, faceting, 0.0)
+        found = np.concatenate([_depth(self._slave_hits, slave), _depth(hits, master)])
+        return np.where(paired, found, 0.0), allowed
 
-    def _tangent_planes(self, resisted: Array) -> tuple[Array, Array]:
-        """Gather `tangent_planes_around` of the master surface at all facets. Collective."""
+    def _gather_points(self, resisted: Array) -> tuple[Array, ...]:
+        """Gather points, opposite points and normals there at all facets of Γc. Collective.
+
+        See `gather_around`; ``resisted`` is the penetration that the law resists, (n_points,).
+        """
         n, slave = self._rows.size, self._slave
-        ray, normal = slave.normal[:n], _normals(self._slave_hits)[:n]
-        origin = slave.place[:n] + self._slave_hits.distance[:n, None] * ray
-        normal = normal * -np.sign(dot(normal, ray))[:, None]
+        points, ray = slave.place[:n], slave.normal[:n]
+        origins = points + self._slave_hits.distance[:n, None] * ray
+        fields = points, origins, _opposite_normals(self._slave_hits, slave)[:n]
         corners = slave.side.corners[slave.side.own]
-        planes = origin[self._rows], normal[self._rows]
-        planes = tangent_planes_around(self._comm, corners, resisted[self._rows], *planes)
-        origin, normal = (gather_rows(self._comm, v) for v in planes)
-        return origin, normal
+        rows = self._rows
+        around = gather_around(self._comm, corners, resisted[rows], *(f[rows] for f in fields))
+        return tuple(gather_rows(self._comm, field) for field in around)
 
     def find_crossed(self, allowed: Array) -> Array:
         """Return the undeformed positions that crossed the other surface, (n, gdim). Collective.
@@ -253,6 +258,12 @@ class _Surface:
 def _depth(hits: Hits, surface: _Surface) -> Array:
     """Return the depth below the surface hit by the normals, (n,) (length), NaN without a hit."""
     return -hits.distance * abs(dot(_normals(hits), surface.normal))
+
+
+def _opposite_normals(hits: Hits, surface: _Surface) -> Array:
+    """Return the outward unit normals of the surface hit by the normals of another, (n, d)."""
+    normal = _normals(hits)
+    return normal * -np.sign(dot(normal, surface.normal))[:, None]
 
 
 def _normals(hits: Hits) -> Array:

@@ -14,9 +14,9 @@ from fenics_contact.checks.penetration import (
     PREDICTED_DEPTH,
     ResistedDepth,
     allowed_depth,
-    depth_below,
     dot,
-    tangent_planes_around,
+    gather_around,
+    predicted_depth,
 )
 from fenics_contact.checks.surface_pieces import SurfacePieces, depth_below_surface
 from fenics_contact.contact.contact import Contact
@@ -89,7 +89,7 @@ class RigidObstacleProbe:
         self.facet, self.reference, self.distance, self.toward = self._find_deepest()
         self.x, _ = places.facets.positions(self.facet, self.reference)
         self.z = self._at(self.field)
-        # Tangent planes predict the displacement as far as the points carry it.
+        # Depths are predicted for the displacement that the points carry.
         self._carried_by_points = self._at(self._in_frame(contact, None))
         closed = contact.status != Status.OPEN
         # Penetration at the points is the law's, even without stiffness.
@@ -97,8 +97,8 @@ class RigidObstacleProbe:
         corners = places.facets.corner_vertices()
         self.resisted = [(corners, resisted.max(axis=1, initial=0.0))]
         origins = self.points + self._gap[:, None] * self._normal
-        planes = origins[places.rows], -self._normal[places.rows]
-        self._planes = tangent_planes_around(self.comm, corners, resisted, *planes)
+        fields = (field[places.rows] for field in (self.points, origins, -self._normal))
+        self._around = gather_around(self.comm, corners, resisted, *fields)
 
     def _in_frame(self, contact: Contact, u: fem.Function | None) -> Array:
         """Return the nodes in the present frame of the obstacle. Collective.
@@ -180,9 +180,12 @@ class RigidObstacleProbe:
         """Return penetration and allowed penetration, (n,) each (length). Collective."""
         places = self.places
         around = resisted.at(places.facets.corner_vertices())[self.facet]
-        planes = depth_below(self._carried_by_points, *(p[self.facet] for p in self._planes))
+        points = (field[self.facet] for field in self._around)
+        predicted = predicted_depth(self._carried_by_points, -self.toward, *points)
+        for depth in predicted:
+            depth[: places.rows.size] = 0.0  # the quadrature points, which resist themselves
         size = places.size[self.facet]
-        allowed = allowed_depth(around, planes, size, size)
+        allowed = allowed_depth(around, predicted, size, size)
         # Deeper in a flat cell another surface may be nearer, and the facet of entry would not be
         # found.
         limit = np.where(around > 0, np.inf, places.facets.heights()[self.facet] / 2)
@@ -201,12 +204,7 @@ class RigidObstacleProbe:
         # In the middle of an obstacle there is no normal.
         depth[index[~(np.linalg.norm(toward, axis=1) > 0.5)]] = np.inf
         inward = -self.places.outward(self.field)[facet]
-        sideways = np.nan_to_num(toward - dot(toward, inward)[:, None] * inward)
-        length = np.linalg.norm(sideways, axis=1, keepdims=True)
-        sideways *= size[index, None] / np.where(length > 0, length, 1.0)
-        narrow = length[:, 0] > 0
-        for direction in (sideways, -sideways):
-            narrow &= self.sampler.sample(place + direction)[0] >= 0
+        narrow = self._is_narrow(place, toward, inward, size[index])
         index, place, inward = index[narrow], place[narrow], inward[narrow]
         surface = None
         if self.comm.allreduce(len(index)):
@@ -222,6 +220,20 @@ class RigidObstacleProbe:
             reach = reach[beyond] + DEPTH_RESOLUTION * size[index]
             depth[index] = reach
         return depth
+
+    def _is_narrow(self, places: Array, toward: Array, inward: Array, size: Array) -> Mask:
+        """Return whether the obstacle is narrower than facets at places inside of it. Collective.
+
+        ``toward`` and ``inward`` are the unit normals of the obstacle and into the body,
+        (n, gdim), ``size`` the sizes of the facets, (n,) (length).
+        """
+        sideways = np.nan_to_num(toward - dot(toward, inward)[:, None] * inward)
+        length = np.linalg.norm(sideways, axis=1, keepdims=True)
+        sideways *= size[:, None] / np.where(length > 0, length, 1.0)
+        narrow = length[:, 0] > 0
+        for direction in (sideways, -sideways):
+            narrow &= self.sampler.sample(places + direction)[0] >= 0
+        return np.asarray(narrow)
 
     def find_crossed(self, allowed: Array) -> Array:
         """Return the undeformed positions that crossed the obstacle in the increment. Collective.
@@ -300,8 +312,9 @@ class RigidObstacleProbe:
         self._follow_points(points, points_end, entered, entry, times)
         middles = self._find_pierced_facets(points_end, field_end, entry, allowed)
         opposite = np.flatnonzero(dot(normal, toward) < OPPOSITE_SIDES)
-        # Along the path the tangent planes are unknown.
-        depth = (allowed[near] + PREDICTED_DEPTH * size)[:, None]
+        # Along the path the prediction is unknown. Quadrature points resist.
+        between = near >= self.places.rows.size
+        depth = (allowed[near] + np.where(between, PREDICTED_DEPTH * size, 0.0))[:, None]
         start, end = start + depth * inward, end + depth * inward_end
         passes = self._find_passages(start[opposite], end[opposite], since, until)
         passes |= entered[opposite]
@@ -405,4 +418,9 @@ class RigidObstacleProbe:
         depth, facet = depth_below_surface(self.comm, points[rows], normal, reach, surface.facets)
         is_too_deep = (facet >= 0) & (depth > surface.allowed[facet])
         is_too_deep &= ~surface.is_shallow(points[rows], normal)
+        # The wall of a wide obstacle enters beside Γc. There the depth is the distance from it.
+        above = points[rows] + depth[:, None] * normal
+        distance, toward = self.sampler.sample(above)
+        narrow = self._is_narrow(above, toward, -normal, surface.size[facet])
+        is_too_deep &= narrow | (distance >= 0)
         return np.asarray(surface.middle[np.unique(facet[is_too_deep])])

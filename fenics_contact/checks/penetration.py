@@ -1,4 +1,4 @@
-"""Bounds of the penetration between quadrature points, from points and tangent planes nearby."""
+"""Bounds of the penetration between quadrature points, from gap and normals at points nearby."""
 
 from __future__ import annotations
 
@@ -19,15 +19,16 @@ __all__ = [
     "PREDICTED_DEPTH",
     "ResistedDepth",
     "allowed_depth",
-    "depth_below",
     "dot",
-    "tangent_planes_around",
+    "gather_around",
+    "predicted_depth",
 ]
 
-# Depths relative to the size of the facet. By tangent planes more penetration is allowed than that
-# of the points around, by these amounts where a point is in contact and where none is: the corner
-# of a tilted facet is 0.2 of its size away from the nearest point.
-PREDICTED_DEPTH, _PREDICTED_DEPTH_OPEN = 0.15, 0.05
+# Depths relative to the size of the facet. If the points predict it, more penetration is allowed
+# than that of the points around: the corner of a facet is 0.2 of its size away from the nearest one
+# (of two), and a tilted facet is as deep there before the point is in contact. Where an obstacle
+# has edges, its tangent planes predict more than it penetrates, also for a pin between the points.
+PREDICTED_DEPTH, _PREDICTED_DEPTH_AT_EDGES = 0.2, 0.05
 # Difference of the penetration between two quadrature rules.
 DEPTH_RESOLUTION = 0.02
 # Largest penetration that was allowed at the last commit where no point is in contact.
@@ -71,60 +72,82 @@ class ResistedDepth:
         return np.asarray(depth.max(axis=1, initial=0.0))
 
 
-def tangent_planes_around(
-    comm: MPI.Comm, corners: Index, resisted: Array, origin: Array, normal: Array
-) -> tuple[Array, Array]:
-    """Collect the obstacle's tangent planes at a facet's points and around its corners. Collective.
+def gather_around(
+    comm: MPI.Comm, corners: Index, resisted: Array, *fields: Array
+) -> tuple[Array, ...]:
+    """Collect fields at the points of every facet and at a point around each corner. Collective.
 
-    For each corner the plane at the deepest point in contact on the facets around it is added:
-    where the opposing surface ends below a facet, no point of the facet itself may have a plane.
+    For each corner the deepest point in contact on the facets around it is added: where the
+    opposing surface ends below a facet, no point of the facet itself may have an opposite point.
 
     Args:
         comm: Communicator.
         corners: Global numbers of the vertices of this rank's facets, (n, n_corners).
         resisted: Penetration at their points that the law resists, (n, n_points) (length).
-        origin: A position in the plane of each point, (n, n_points, gdim) (length).
-        normal: Outward unit normal of the plane, (n, n_points, gdim).
+        fields: Fields at the points, (n, n_points, gdim) each.
 
     Returns:
-        Positions and normals, (n, n_points + n_corners, gdim) each, NaN without a plane.
+        The fields, (n, n_points + n_corners, gdim) each, NaN without a point.
     """
     n, n_corners = corners.shape
     deepest = (np.arange(n), resisted.argmax(axis=1)) if n else (np.arange(0), np.arange(0))
-    rows = np.column_stack([-resisted[deepest], origin[deepest], normal[deepest]])
-    has_plane = (rows[:, 0] < 0) & ~np.isnan(rows).any(axis=1)
-    table = np.repeat(rows[has_plane], n_corners, axis=0)
-    table = gather_rows(comm, np.column_stack([corners[has_plane].ravel(), table]))
+    rows = np.column_stack([-resisted[deepest], *(field[deepest] for field in fields)])
+    is_known = (rows[:, 0] < 0) & ~np.isnan(rows).any(axis=1)
+    table = np.repeat(rows[is_known], n_corners, axis=0)
+    table = gather_rows(comm, np.column_stack([corners[is_known].ravel(), table]))
     table = table[np.lexsort(table.T[::-1])]
     vertices, first = np.unique(table[:, 0], return_index=True)
     table = np.concatenate([table[first, 2:], np.full((1, table.shape[1] - 2), np.nan)])
     index = np.searchsorted(vertices, corners)
     index[np.append(vertices, np.nan)[index] != corners] = len(vertices)
-    around = np.split(table[index], 2, axis=2)
-    return np.append(origin, around[0], axis=1), np.append(normal, around[1], axis=1)
+    around = np.split(table[index], len(fields), axis=2)
+    return tuple(np.append(*pair, axis=1) for pair in zip(fields, around, strict=True))
 
 
-def depth_below(positions: Array, origin: Array, normal: Array) -> Array:
-    """Return the largest depth of positions (n, d) below planes, (n,) (length); -inf without any.
+def predicted_depth(
+    positions: Array, normals: Array, points: Array, origins: Array, point_normals: Array
+) -> tuple[Array, Array]:
+    """Predict the penetration at positions from points nearby; -inf without any.
 
-    ``origin`` has a position in each plane, (n, m, d), NaN without one, ``normal`` the normals.
+    The gradient of the gap is the normal of the obstacle, and the gap at a position follows from
+    that at a point by the trapezoidal rule: exactly on plane obstacles, to third order on curved
+    ones. The tangent plane at the point bounds the penetration of convex obstacles, also at edges.
+
+    Args:
+        positions: The positions x, (n, gdim) (length).
+        normals: Outward unit normals of the obstacle nearest to them, (n, gdim).
+        points: Points around each position, (n, m, gdim) (length).
+        origins: The points of the obstacle nearest to these, (n, m, gdim) (length); NaN without.
+        point_normals: Outward unit normals of the obstacle there, (n, m, gdim).
+
+    Returns:
+        The penetration by the trapezoidal rule, and below tangent planes, (n,) each (length).
     """
-    depth = -np.einsum("nqd,nqd->nq", positions[:, None] - origin, normal)
-    return np.where(np.isnan(depth), -np.inf, depth).max(axis=1, initial=-np.inf)
+    plane = np.einsum("nqd,nqd->nq", origins - positions[:, None], point_normals)
+    change = np.nan_to_num(normals)[:, None] - point_normals
+    curvature = 0.5 * np.einsum("nqd,nqd->nq", points - positions[:, None], change)
+    by_rule, by_planes = (
+        np.where(np.isnan(depth), -np.inf, depth).max(axis=1, initial=-np.inf)
+        for depth in (plane + curvature, plane)
+    )
+    return by_rule, by_planes
 
 
-def allowed_depth(resisted: Array, planes: Array, facet: Array, smaller: Array) -> Array:
+def allowed_depth(
+    resisted: Array, predicted: tuple[Array, Array], facet: Array, smaller: Array
+) -> Array:
     """Return the penetration that is allowed between points, (n,) (length).
 
     Args:
         resisted: Penetration of the points around, (n,).
-        planes: Depth below the tangent planes at these points, (n,).
+        predicted: `predicted_depth`, (n,) each.
         facet: Size of the facet of Γc, (n,).
         smaller: Size of the smaller one of the two opposing facets, (n,).
     """
-    ratio = np.where(resisted > 0, PREDICTED_DEPTH, _PREDICTED_DEPTH_OPEN)
-    predicted = np.minimum(planes, resisted + ratio * facet)
-    return np.maximum(resisted, predicted) + DEPTH_RESOLUTION * smaller
+    allowed = resisted
+    for depth, ratio in zip(predicted, (PREDICTED_DEPTH, _PREDICTED_DEPTH_AT_EDGES), strict=True):
+        allowed = np.maximum(allowed, np.minimum(depth, resisted + ratio * facet))
+    return allowed + DEPTH_RESOLUTION * smaller
 
 
 def dot(one: Array, other: Array) -> Array:

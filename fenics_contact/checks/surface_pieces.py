@@ -26,7 +26,9 @@ class SurfacePieces:
     Attributes:
         comm: Communicator.
         facets: This rank's pieces, at rest.
-        allowed: Allowed depth below each piece, (n,) (length).
+        allowed: Allowed depth below each piece, with the deviation of its facet from it, (n,)
+            (length).
+        size: Size of the facet of each piece, (n,) (length).
         corner: First corner of each piece, (n, gdim) (length).
         normal: Outward unit normals, (n, gdim).
         middle: Midpoints on the undeformed Γc, (n, gdim) (length).
@@ -35,6 +37,7 @@ class SurfacePieces:
     comm: MPI.Comm
     facets: MovingFacets
     allowed: Array
+    size: Array
     corner: Array
     normal: Array
     middle: Array
@@ -51,10 +54,13 @@ class SurfacePieces:
         bound: Array = np.zeros(len(places.size))
         np.maximum.at(bound, facet, allowed)
         facets, middles = places.moving_facets(field, field), places.piece_centres()
-        bound = np.repeat(bound, len(middles) // max(len(bound), 1))
-        table = np.column_stack([bound, facets.start[:, 0], facets.normals(), middles])
+        n_pieces = len(middles) // max(len(bound), 1)
+        bound = np.repeat(bound, n_pieces) + places.piece_deviations(field)
+        size = np.repeat(places.size, n_pieces)
+        table = np.column_stack([bound, size, facets.start[:, 0], facets.normals(), middles])
         table = gather_rows(comm, table)
-        return cls(comm, facets, table[:, 0], *np.split(table[:, 1:], 3, axis=1))
+        fields = np.split(table[:, 2:], 3, axis=1)
+        return cls(comm, facets, table[:, 0], table[:, 1], *fields)
 
     def is_shallow(self, points: Array, normal: Array) -> Mask:
         """Return whether points are within the allowed depth below an adjacent face. Collective.

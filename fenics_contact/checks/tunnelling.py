@@ -1,7 +1,7 @@
 """Penetration between the quadrature points of Γc, and tunnelling, at the positions X + u.
 
 - *Depth.* At points, corners, and midpoints of edges and facets the penetration must not exceed
-  that of the nearby quadrature points by more than their tangent planes predict.
+  that of the nearby quadrature points by more than gap and normals there predict.
 - *Path.* Within an increment no such position may pass through an opposing body, and no point of
   a rigid obstacle near Γc may enter the body.
 """

@@ -122,6 +122,14 @@ class FacetSampling:
         sign = np.repeat(self.facets.outward, n_pieces)
         return MovingFacets(first, last, sign, vertices)
 
+    def piece_deviations(self, field: Array) -> Array:
+        """Return the distance of every flat piece from its facet at its centre, (n,) (length)."""
+        nodes, centres = self._by_facet(field), self._pieces.mean(axis=1)
+        curved = tabulate(self._element, 0, centres)[0, :, :, 0] @ nodes
+        corners = tabulate(self._element, 0, np.concatenate(self._pieces))[0, :, :, 0] @ nodes
+        flat = corners.reshape(len(nodes), *self._pieces.shape[:2], field.shape[1]).mean(axis=2)
+        return np.asarray(np.linalg.norm(curved - flat, axis=2).ravel())
+
     def piece_centres(self) -> Array:
         """Return the centres of the facets' flat pieces on the undeformed Γc, (n, gdim)."""
         return self.facets.positions(*self.facets.combine(self._pieces.mean(axis=1)))[0]
