@@ -10,7 +10,7 @@ import ufl
 
 import fenics_contact as fc
 from scenes.bodies import Bodies, boxes
-from scenes.comparison import assert_raised_on_all_ranks, is_close
+from scenes.comparison import is_close
 from scenes.tags import at_coordinate
 
 pytestmark = [pytest.mark.two_ranks, pytest.mark.timeout(240)]
@@ -103,20 +103,10 @@ def test_default_points_where_the_radius_is_resolved():
 def test_insufficient_points_cause_a_warning(enforcement):
     """If the radius is not given, a warning proposes a degree; with enough points there is none.
 
-    With multipliers at the nodes only, the tool is refused: it penetrates a tenth of the facet more
-    than the nodes.
-
     Reference: with the proposed degree the force is that of 40 points, to 4 %.
     """
     with pytest.warns(UserWarning, match="as long as the radius of curvature") as caught:
-        if enforcement == "penalty":
-            normal_forces_of_tool("distance", 2.0)
-        else:
-            assert_raised_on_all_ranks(
-                lambda: normal_forces_of_tool("distance", 2.0, enforcement=enforcement),
-                fc.NotConverged,
-                "penetrates",
-            )
+        normal_forces_of_tool("distance", 2.0, enforcement=enforcement)
     degree = int(str(caught[0].message).split("quadrature_degree=")[1].split(")")[0])
     with warnings.catch_warnings():
         warnings.simplefilter("error")

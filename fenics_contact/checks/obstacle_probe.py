@@ -199,7 +199,8 @@ class RigidObstacleProbe:
         is searched along the normal of Γc.
         """
         depth = -self.distance
-        index = np.flatnonzero((depth > 0) & (depth <= allowed))
+        between = np.arange(len(depth)) >= self.places.rows.size  # not at quadrature points
+        index = np.flatnonzero(between & (depth > 0) & (depth <= allowed))
         facet, place, toward = self.facet[index], self.z[index], self.toward[index]
         # In the middle of an obstacle there is no normal.
         depth[index[~(np.linalg.norm(toward, axis=1) > 0.5)]] = np.inf

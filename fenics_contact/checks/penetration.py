@@ -26,9 +26,9 @@ __all__ = [
 
 # Depths relative to the size of the facet. If the points predict it, more penetration is allowed
 # than that of the points around: the corner of a facet is 0.2 of its size away from the nearest one
-# (of two), and a tilted facet is as deep there before the point is in contact. Where an obstacle
-# has edges, its tangent planes predict more than it penetrates, also for a pin between the points.
-PREDICTED_DEPTH, _PREDICTED_DEPTH_AT_EDGES = 0.2, 0.05
+# (of two), and a tilted facet is as deep there before the point is in contact. Tangent planes,
+# which also predict a pin between the points, count as much only where a point is in contact.
+PREDICTED_DEPTH, _DEPTH_BY_PLANES_OPEN = 0.2, 0.05
 # Difference of the penetration between two quadrature rules.
 DEPTH_RESOLUTION = 0.02
 # Largest penetration that was allowed at the last commit where no point is in contact.
@@ -144,10 +144,11 @@ def allowed_depth(
         facet: Size of the facet of Γc, (n,).
         smaller: Size of the smaller one of the two opposing facets, (n,).
     """
-    allowed = resisted
-    for depth, ratio in zip(predicted, (PREDICTED_DEPTH, _PREDICTED_DEPTH_AT_EDGES), strict=True):
-        allowed = np.maximum(allowed, np.minimum(depth, resisted + ratio * facet))
-    return allowed + DEPTH_RESOLUTION * smaller
+    by_rule, by_planes = predicted
+    limit = resisted + PREDICTED_DEPTH * facet
+    limit_of_planes = np.where(resisted > 0, limit, _DEPTH_BY_PLANES_OPEN * facet)
+    allowed = np.maximum(np.minimum(by_rule, limit), np.minimum(by_planes, limit_of_planes))
+    return np.maximum(resisted, allowed) + DEPTH_RESOLUTION * smaller
 
 
 def dot(one: Array, other: Array) -> Array:
