@@ -59,7 +59,7 @@ REASONS = {
 # Causes of the refusals of increments that the independent solver solves: words of features or
 # message, the first that applies.
 CAUSES = {
-    "iteration limit": "iterations or cuts are limited by the scene",
+    "iteration limit": "the scene limits the number of iterations",
     "has no potential": "the requested method requires a potential",
     "nor contact constrain": "a rigid-body mode is free, though no force acts along it",
     "has crossed": "Γc passes through the obstacle, mostly a thin rod",
@@ -179,8 +179,9 @@ def page(rows_by_campaign: dict[str, list[Row]]) -> str:
         "zero after a restart (818207), which is correct now, and a body strained by 3e-6 that is "
         "displaced by 29 lengths, which is solved without that displacement (818871). Facets that "
         "face several others of a rotated body were divided at the wrong places, by both solvers "
-        "(819161), and a slanted rod passed through a quadrature point (819149): both are correct "
-        "now. The independent solver took the centreline of a pin for its surface (819411).",
+        "(819161; correct now up to a load that no contact force balances), and a slanted rod "
+        "passed through a quadrature point (819149; refused now). The independent solver took the "
+        "centreline of a pin for its surface (819411).",
         "- Not explained, besides the first, are a penetration with multipliers 10 % above the "
         "tolerance, on a single facet (815746), and a slip reference 1e-4 of the body's size "
         "inside the obstacle, a plate that slides past the body (815922).",

@@ -613,7 +613,7 @@ class Comparison:
         through = np.where(state == 1, height, 0.0).max()
         facet = float(contact.slave.lengths().max())
         wide = np.ptp(spine[:, 0]) > 2 * facet
-        allowed = (0.02 if wide else _ROD_DEPTH) * facet + contact.radius
+        allowed = 0.02 * facet if wide else _ROD_DEPTH * facet + contact.radius
         self._check(name, "crossed", through, allowed)
 
     def _check_kinematics(

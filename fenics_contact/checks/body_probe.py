@@ -130,12 +130,12 @@ class OpposingBodyProbe:
         normals = np.concatenate([_opposite_normals(self._slave_hits, slave), master.normal])
         points = (field[on_slave] for field in self._around)
         predicted = predicted_depth(positions, normals, *points)
-        for depth in predicted:
-            depth[on_slave < 0] = -np.inf
+        for prediction in predicted:
+            prediction[on_slave < 0] = -np.inf
         smaller = np.where(paired, np.minimum(size, other), np.where(on_slave >= 0, size, other))
         allowed = allowed_depth(around, predicted, size, smaller) + np.where(paired, faceting, 0.0)
-        found = np.concatenate([_depth(self._slave_hits, slave), _depth(hits, master)])
-        return np.where(paired, found, 0.0), allowed
+        depth = np.concatenate([_depth(self._slave_hits, slave), _depth(hits, master)])
+        return np.where(paired, depth, 0.0), allowed
 
     def _gather_points(self, resisted: Array) -> tuple[Array, ...]:
         """Gather points, opposite points and normals there at all facets of Γc. Collective.
@@ -143,8 +143,8 @@ class OpposingBodyProbe:
         See `gather_around`; ``resisted`` is the penetration that the law resists, (n_points,).
         """
         n, slave = self._rows.size, self._slave
-        points, ray = slave.place[:n], slave.normal[:n]
-        origins = points + self._slave_hits.distance[:n, None] * ray
+        points = slave.place[:n]
+        origins = points + self._slave_hits.distance[:n, None] * slave.normal[:n]
         fields = points, origins, _opposite_normals(self._slave_hits, slave)[:n]
         corners = slave.side.corners[slave.side.own]
         rows = self._rows

@@ -182,8 +182,8 @@ class RigidObstacleProbe:
         around = resisted.at(places.facets.corner_vertices())[self.facet]
         points = (field[self.facet] for field in self._around)
         predicted = predicted_depth(self._carried_by_points, -self.toward, *points)
-        for depth in predicted:
-            depth[: places.rows.size] = 0.0  # the quadrature points, which resist themselves
+        for prediction in predicted:  # quadrature points resist themselves
+            prediction[: places.rows.size] = 0.0
         size = places.size[self.facet]
         allowed = allowed_depth(around, predicted, size, size)
         # Deeper in a flat cell another surface may be nearer, and the facet of entry would not be
