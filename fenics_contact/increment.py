@@ -28,6 +28,7 @@ from fenics_contact.step import Step
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.modulus_tracking import TrackedModulus
+from fenics_contact.systems.partition import Partition
 from fenics_contact.systems.system import System
 from fenics_contact.types import Array
 
@@ -279,7 +280,7 @@ class IncrementSolver:
         start, coordinate_id = state.energy, self.solver.system.coordinate_id
         if self.full.coordinate_id not in energies.forces and coordinate_id not in start.forces:
             # From rest, and on the retained dofs only: there are no forces at the start.
-            zero = Forces.zero(np.zeros(1), np.zeros(1, dtype=np.intp))
+            zero = Forces.zero(np.zeros(1), Partition(np.zeros(1, dtype=np.intp), 1))
             start = start.with_forces(coordinate_id, zero)
         if points.replaced:
             start = start.with_committed_jumps(self.full.contacts)

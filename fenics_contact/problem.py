@@ -197,7 +197,7 @@ class ContactProblem:
             bulk = self.full.with_obstacles(self.full.bulk.assemble_residual())
             forces: dict[object, Forces] = {coordinate_id: self.full.present_forces(bulk)}
             return State(unknowns, contacts, load, EnergyState.at(forces, self.contacts), zero)
-        forces = {coordinate_id: Forces.zero(unknowns, self.full.label)}
+        forces = {coordinate_id: Forces.zero(unknowns, self.full.partition)}
         energy = EnergyState.unloaded(forces, self.contacts)
         return State(unknowns, contacts, zero, energy, zero)
 
@@ -599,7 +599,7 @@ class ContactProblem:
             self.contacts, points, updates_pairs, strict=True
         ):
             contact.states.load_restart(history, values, updates_pairs=bool(again))
-        forces = Forces(state, internal, external, self.full.label)
+        forces = Forces(state, internal, external, self.full.partition)
         energy = EnergyState.at({self.full.coordinate_id: forces}, self.contacts)
         self.state = State(
             unknowns=state.copy(),

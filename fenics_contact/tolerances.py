@@ -4,7 +4,14 @@ import numpy as np
 
 from fenics_contact.types import Array, Index
 
-__all__ = ["FLAT", "NEGLIGIBLE", "ROUND_OFF", "UNLOADED_FORCE_RATIO", "sort_by_coordinates"]
+__all__ = [
+    "FLAT",
+    "MIN_FORCE",
+    "NEGLIGIBLE",
+    "ROUND_OFF",
+    "UNLOADED_FORCE_RATIO",
+    "sort_by_coordinates",
+]
 
 # Sums and differences of forces, stiffness, work or weights, relative to the largest term.
 ROUND_OFF = 1e-12
@@ -16,6 +23,8 @@ FLAT = 1e-6
 # Contact force on a rigid-body mode, relative to the load on it, below which the mode counts as
 # unloaded.
 UNLOADED_FORCE_RATIO = 1e-3
+# Forces below this, in any units, are subnormal remainders of a load that was removed.
+MIN_FORCE = np.finfo(float).tiny / np.finfo(float).eps
 
 
 def sort_by_coordinates(x: Array) -> Index:

@@ -126,6 +126,16 @@ def test_deformation_by_a_stiffness_in_wrong_units_fails(condensation):
     assert pushed(1e6, top=50.0).verdict.deformation["the body"] < 0.1
 
 
+def test_deformation_is_verified_with_the_recovered_interior():
+    """Without its interior a deformation is unknown; `complete` finds that it is too large."""
+    scene = block("quadrilateral", n=4, E=0.02, up=-1.0)
+    bcs = [scene.dirichlet_bc(TOP, 0)]
+    problem, _ = scene.problem(fc.Frictionless(), bcs, condensation=True)
+    assert problem.solve(recover_interior=False).verdict.deformation == {}
+    with pytest.raises(fc.NotConverged, match="times its size"):
+        problem.complete()
+
+
 def test_small_displacement_warning_is_repeated_at_each_doubling():
     """The warning is repeated when the error has doubled; every summary above 1 % states it."""
     problem, _ = dragged_block(body=-0.2, small_displacement_tolerance=0.5)

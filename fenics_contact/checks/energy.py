@@ -107,7 +107,6 @@ class EnergyState:
         shared_id = next(coordinates for coordinates in self.forces if coordinates in before.forces)
         old, new = before.forces[shared_id], self.forces[shared_id]
         displacement = new.unknowns - old.unknowns
-        groups = scales.group[new.label]
         # By group: work, elastic, springs, dissipation, work of the tractions, work of friction,
         # bound of the work of friction, magnitude of the energies.
         sums: Array = np.zeros((8, scales.n_groups))
@@ -115,9 +114,10 @@ class EnergyState:
         def add(row: int, values: Array, groups: Index) -> None:
             sums[row] += np.bincount(groups, values, minlength=scales.n_groups)
 
-        add(7, np.abs(new.internal * new.unknowns), groups)
-        add(0, 0.5 * (old.external + new.external) * displacement, groups)
-        add(1, 0.5 * (old.internal + new.internal) * displacement, groups)
+        parts = new.partition
+        add(7, parts.absolute_sums(new.internal * new.unknowns), scales.group)
+        add(0, 0.5 * parts.products(old.external + new.external, displacement), scales.group)
+        add(1, 0.5 * parts.products(old.internal + new.internal, displacement), scales.group)
         states = zip(
             contacts, before.contacts, self.contacts, before.springs, self.springs, strict=True
         )

@@ -114,7 +114,8 @@ class Verdict:
         small_displacement_tolerance: Largest small-displacement error accepted. If it is finite, no
             body may deform by more than five times its size.
         deformation: By body, the largest displacement without rigid-body motion, divided by the
-            size of the body or the range of its Dirichlet values, whichever is larger.
+            size of the body or the range of its Dirichlet values, whichever is larger; empty
+            until the interior displacement is recovered.
         ejected_bodies: By ejected body, its displacement, the largest displacement accepted, and
             the largest one nearby (length).
         friction_energy_gain: Energy supplied by friction, relative to the energy exchanged.

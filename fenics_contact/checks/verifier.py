@@ -54,6 +54,9 @@ class Verifier:
         self._warned_round_off: set[str] = set()
         self._warned_resolution: set[tuple[str, str]] = set()
         # The pseudo-inverse serves bodies of one node, without rotations.
+        # Numbers of the prescribed displacements along each axis.
+        translations = motions.of_bodies[: full.gdim] != 0.0
+        self._prescribed = [np.flatnonzero(moved & full.constrained) for moved in translations]
         self._inverse = np.linalg.pinv(motions.gram_by_body(), hermitian=True)
 
     def verify(
@@ -122,7 +125,7 @@ class Verifier:
                 else {}
             ),
             small_displacement_tolerance=self.small_displacement_tolerance,
-            deformation=self._deformation(),
+            deformation=self._deformation() if complete else {},
             ejected_bodies=ejected,
             inverted=self._full.bulk.is_inverted(),
             cross_check=self._cross_check.compare() if self._cross_check and laws else {},
@@ -171,8 +174,7 @@ class Verifier:
         rigid = np.einsum("bmn,bn->bm", self._inverse, sums)
         deformation = scales.largest(state - motions.field(rigid))
         spread: Array = np.zeros(len(rigid))
-        for translation in motions.of_bodies[: full.gdim]:
-            prescribed = (translation != 0.0) & full.constrained
+        for prescribed in self._prescribed:
             spread = np.maximum(spread, scales.spread(state, prescribed))
         ratios = deformation / np.maximum(scales.size, spread)
         return dict(zip(full.parts.names, ratios.tolist(), strict=False))
@@ -195,9 +197,9 @@ class Verifier:
         for operator in self._full.operators:
             contact = operator.contact
             total -= self._motions.work(operator, contact.measure[:, None] * contact.traction)
-        count = np.bincount(system.label, minlength=n)[:n]
-        sizes = [np.bincount(system.label, np.abs(f), minlength=n)[:n] for f in forces]
-        sums = global_sum(self._comm, np.stack([*total.T, count, np.sum(sizes, axis=0)]))
+        sizes = np.sum([system.partition.absolute_sums(force) for force in forces], axis=0)
+        sums = np.stack([*total.T, system.partition.sizes[:n], sizes[:n]])
+        sums = global_sum(self._comm, sums)
         # Moments that are NaN are omitted: a NaN force is found in the translations.
         rotations = sums[self._full.gdim : -2]
         rotations[np.isnan(rotations)] = 0.0

@@ -109,7 +109,7 @@ def _scale_down_multipliers(equations: Equations, load_before: Array) -> None:
         if operator.contact.multipliers is None:
             continue
         coupled = np.zeros(full.n_bodies)
-        coupled[full.label[operator.coupled_dofs]] = 1.0
+        coupled[full.partition.label[operator.coupled_dofs]] = 1.0
         bodies = global_sum(full.unknowns.comm, coupled) > 0.0
         if not sizes[1, bodies].any():  # bodies loaded by others only: all of the group
             bodies = np.isin(full.scales.group, full.scales.group[bodies])

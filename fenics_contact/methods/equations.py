@@ -135,7 +135,7 @@ class Equations:
         # unknown until a matrix is assembled.
         left_out = self.norms.is_round_off & self.is_round_off_known
         self.norms = self.norms.exclude(left_out)
-        total[self.system.constrained | left_out[self.system.label]] = 0.0
+        total[self.system.constrained | left_out[self.system.partition.label]] = 0.0
         f.array[:] = total / (self._bulk.scale * self.length)
         return self.norms
 
@@ -318,5 +318,6 @@ class Equations:
             diagonal.destroy()
         # The rigid motion of an obstacle has no bulk stiffness.
         stiffness = np.append(self.full.scales.stiffness, np.full(self.system.n_bodies, np.inf))
-        has_stiffness = (bulk > ROUND_OFF * stiffness[self.system.label]) & ~self.system.constrained
+        of_body = stiffness[self.system.partition.label]
+        has_stiffness = (bulk > ROUND_OFF * of_body) & ~self.system.constrained
         return global_max(self._comm, added[has_stiffness] / bulk[has_stiffness])

@@ -120,7 +120,7 @@ class PairIteration:
         """
         full, n = self._full, self._full.unknowns.n_dofs
         prescribed_dofs, stiffness = full.constrained[:n], full.bulk.scale
-        groups = full.scales.group[full.label]
+        groups = full.scales.group[full.partition.label]
 
         def forces(displacement: Array, force: Array) -> Array:
             return np.where(prescribed_dofs, stiffness * displacement[:n], force[:n])

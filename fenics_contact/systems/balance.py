@@ -8,19 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from fenics_contact.parallel import global_sum
+from fenics_contact.systems.partition import Partition, norms_by_part
 from fenics_contact.systems.reference_scales import ReferenceScales
-from fenics_contact.tolerances import ROUND_OFF
+from fenics_contact.tolerances import MIN_FORCE, ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["MAX_ROUND_OFF_RESIDUAL_RATIO", "InitialForces", "Labels", "Norms", "Parts", "by_body"]
-
-Labels = npt.NDArray[np.intp]
+__all__ = ["MAX_ROUND_OFF_RESIDUAL_RATIO", "InitialForces", "Norms", "Parts"]
 
 # Round-off of K u relative to the summed magnitudes of its terms; rigid motions leave up to 14 eps
 # on random tetrahedra of degree 2, and 34 eps on a distorted mesh.
@@ -30,8 +29,6 @@ _KU_ROUND_OFF = 40 * np.finfo(float).eps
 _MAX_DISPLACEMENT_RATIO = 1e3
 # Largest round-off tolerance relative to the load or, without constraints, to the contact forces.
 MAX_ROUND_OFF_RESIDUAL_RATIO = 1e-5
-# Forces below this are subnormal remainders of a load that was removed.
-_MIN_FORCE = np.finfo(float).tiny / np.finfo(float).eps
 
 
 @dataclass(frozen=True)
@@ -105,7 +102,8 @@ class Parts:
 
     Attributes:
         comm: MPI communicator.
-        label: Body or free obstacle of every unknown of this rank, (n_local,).
+        partition: Bodies and free obstacles of this rank's unknowns.
+        constrained: Mask of the unknowns with Dirichlet conditions, (n_local,).
         bodies: Names of bodies, then of free obstacles.
         contacts: Names of the contacts.
         coupled: Unknowns of this rank that each contact couples.
@@ -116,7 +114,8 @@ class Parts:
     """
 
     comm: MPI.Comm
-    label: Labels
+    partition: Partition
+    constrained: Mask
     bodies: Sequence[str]
     contacts: Sequence[str]
     coupled: Sequence[npt.NDArray[np.int32]]
@@ -129,13 +128,29 @@ class Parts:
         """Names of bodies, free obstacles and contacts."""
         return [*self.bodies, *self.contacts]
 
+    @cached_property
+    def _reactions(self) -> tuple[Index, Partition]:
+        """Numbers of the unknowns with reactions, and their partition."""
+        constrained = np.flatnonzero(self.constrained)
+        return constrained, self.partition.restrict(constrained)
+
+    @cached_property
+    def _contact_dofs(self) -> tuple[Index, Partition]:
+        """Numbers of the unknowns on which any contact acts, and their partition."""
+        coupled = np.unique(np.concatenate([np.zeros(0, dtype=np.intp), *self.coupled]))
+        return coupled, self.partition.restrict(coupled)
+
+    @cached_property
+    def _partitions(self) -> list[Partition]:
+        """Partition of the unknowns that each contact couples."""
+        return [self.partition.restrict(coupled) for coupled in self.coupled]
+
     def norms(
         self,
         residual: Array,
         contacts: Sequence[Array],
         load: Array,
         product: Array,
-        constrained: Mask,
         outside: Array,
         start: InitialForces,
     ) -> Norms:
@@ -146,19 +161,19 @@ class Parts:
             contacts: Contribution of every contact to it, (n_local,).
             load: External forces, (n_local,).
             product: Magnitude of the terms of K u, (n_local,).
-            constrained: Mask of the unknowns with Dirichlet conditions.
             outside: Norms of load and product at unknowns outside of the system, (2, n_bodies).
             start: Forces at the start of the increment.
         """
-        n, free = len(self.bodies), np.where(constrained, 0.0, residual)
-        reaction = residual - free
-        total = contacts[0] if len(contacts) == 1 else sum(contacts, np.zeros_like(residual))
-        rows = [(v, self.label) for v in (free, reaction, total, load, product)]
-        for force, coupled in zip(contacts, self.coupled, strict=True):
-            bodies = self.label[coupled]
-            nodal = np.where(constrained, 0.0, force)[coupled]
-            rows += [(free[coupled], bodies), (nodal, bodies)]
-        norms = _compute_norms(self.comm, rows, n)
+        n, free, (constrained, reactions_on) = len(self.bodies), residual.copy(), self._reactions
+        free[constrained] = 0.0
+        any_contact, total_on = self._contact_dofs
+        total = sum((force[any_contact] for force in contacts), np.zeros(any_contact.size))
+        rows = [(free, self.partition), (residual[constrained], reactions_on), (total, total_on)]
+        rows += [(load, self.partition), (product, self.partition)]
+        for force, coupled, own in zip(contacts, self.coupled, self._partitions, strict=True):
+            nodal = np.where(self.constrained[coupled], 0.0, force[coupled])
+            rows += [(free[coupled], own), (nodal, own)]
+        norms = norms_by_part(self.comm, rows)
         residuals, reactions, resultants, loads, terms = norms[:5]
         loads, terms = np.hypot(loads, outside[0]), np.hypot(terms, outside[1])
         local_residual, local_force = norms[5::2], norms[6::2]
@@ -172,7 +187,7 @@ class Parts:
         bound = _MAX_DISPLACEMENT_RATIO * np.maximum(of_bodies, start.terms)
         terms = np.maximum(terms, start.terms)
         terms = np.where(fixed, terms, np.minimum(terms, bound))
-        round_off = np.maximum(_KU_ROUND_OFF * terms, _MIN_FORCE)
+        round_off = np.maximum(_KU_ROUND_OFF * terms, MIN_FORCE)
         # The softer body limits the accuracy of a contact force.
         limits = np.tile(round_off, (len(contacts), 1))
         for row, pairs in zip(limits, self.pairs, strict=True):
@@ -192,7 +207,7 @@ class Parts:
             for norm in (force, local_force)
         )
         floor = np.where(limited, np.minimum(round_off, cap), round_off)
-        floor = np.maximum(floor, _MIN_FORCE)
+        floor = np.maximum(floor, MIN_FORCE)
         local_floor = np.where(active, np.minimum(round_off, local_cap), round_off)
         uncapped = np.where(
             active & (unloaded <= MAX_ROUND_OFF_RESIDUAL_RATIO * local_force), round_off, 0.0
@@ -234,14 +249,9 @@ def _measure_contact(
     balanced = np.where(relative[first] <= relative[second], first, second)
     balanced = balanced[force[balanced] > 0]
     if not balanced.size:
-        return 0.0, 0.0, _MIN_FORCE, 0.0
+        return 0.0, 0.0, MIN_FORCE, 0.0
     body = balanced[np.argmax(relative[balanced])]
-    return residual[body], force[body], max(floor[body], _MIN_FORCE), round_off[body]
-
-
-def by_body(comm: MPI.Comm, vectors: Sequence[Array], label: Labels, n_bodies: int) -> Array:
-    """Return the norms of vectors, (n_local,) each, by body: (n_vectors, n_bodies). Collective."""
-    return _compute_norms(comm, [(v, label) for v in vectors], n_bodies)
+    return residual[body], force[body], max(floor[body], MIN_FORCE), round_off[body]
 
 
 def _root_sum_square(values: Array) -> float:
@@ -250,21 +260,3 @@ def _root_sum_square(values: Array) -> float:
     if not (largest > 0 and np.isfinite(largest)):
         return largest
     return largest * float(np.sqrt(np.sum((values / largest) ** 2)))
-
-
-def _compute_norms(comm: MPI.Comm, rows: Sequence[tuple[Array, Labels]], n: int) -> Array:
-    """Return the norms of vectors by the label of each entry, (n_vectors, n). Collective.
-
-    Vectors are scaled against overflow and underflow. The norms of a vector with an entry that is
-    not finite are NaN for all labels.
-    """
-    largest = np.array([np.abs(values).max(initial=0.0) for values, _ in rows])
-    largest[np.isnan(largest)] = np.inf  # the maximum of MPI has no rule for NaN
-    comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-    scales = np.where((largest > 0.0) & np.isfinite(largest), largest, 1.0)
-    squares = np.zeros((len(rows), n))
-    with np.errstate(all="ignore"):
-        for row, (values, label), scale in zip(squares, rows, scales, strict=True):
-            row[:] = np.bincount(label, (values / scale) ** 2, minlength=n)
-        norms = scales[:, None] * np.sqrt(global_sum(comm, squares))
-    return np.where(np.isfinite(largest)[:, None], norms, np.nan)

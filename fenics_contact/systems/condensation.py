@@ -13,15 +13,14 @@ import dolfinx
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from fenics_contact.parallel import collective_errors, global_sum
-from fenics_contact.systems.balance import Labels, by_body
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.dissection import BlockFactorisation, Dissection
+from fenics_contact.systems.partition import Partition, norms_by_part
 from fenics_contact.systems.unknowns import DofSubset
-from fenics_contact.tolerances import ROUND_OFF
+from fenics_contact.tolerances import MIN_FORCE, ROUND_OFF
 from fenics_contact.types import Array, Index, Indices, Mask
 
 __all__ = ["Condensation", "ParticularSolution"]
@@ -42,7 +41,7 @@ class Condensation:
         unknowns: The retained unknowns.
         constrained: Mask of the prescribed unknowns of this rank, (n_local,).
         prefix: Options prefix of the factorisation.
-        label: Body of every unknown of this rank, (n_local,); by default there is one body.
+        partition: Bodies of this rank's unknowns; by default there is one body.
 
     Attributes:
         schur: Schur complement S, (n_retained, n_retained) on the first rank, Fortran order
@@ -63,19 +62,18 @@ class Condensation:
         constrained: Mask,
         *,
         prefix: str = "",
-        label: Labels | None = None,
+        partition: Partition | None = None,
     ) -> None:
         self._stiffness, self._unknowns, self._comm = stiffness, unknowns, unknowns.comm
         outside = np.ones(constrained.size, dtype=np.bool_)
         outside[unknowns.retained] = False
         self._prescribed = np.flatnonzero(outside & constrained).astype(np.int32)
-        label = np.zeros(constrained.size, dtype=np.intp) if label is None else label
-        self._label = np.concatenate([label, label[self._prescribed]])
-        self._labels = (
-            label,
-            unknowns.gather(label[unknowns.retained].astype(np.float64)).astype(int),
-        )
-        self._n_bodies = 1 + self._comm.allreduce(int(label.max(initial=0)), op=MPI.MAX)
+        if partition is None:
+            partition = Partition(np.zeros(constrained.size, dtype=np.intp), 1)
+        label = np.concatenate([partition.label, partition.label[self._prescribed]])
+        # Of loads and prescribed values, of all unknowns, and of the retained ones.
+        self._of_loads = Partition(label, partition.n_parts)
+        self._partitions = partition, unknowns.gather_partition(partition)
         self._right, self._left = stiffness.createVecs()
         self.load_directions: list[tuple[Array, ParticularSolution]] = []
         self._scale = bulk.scale
@@ -134,35 +132,32 @@ class Condensation:
         sizes = self._norm_by_body(remainder)
         coefficients: list[Array] = []
         for direction, _ in self.load_directions:
-            coefficients.append(self._sum_by_body(direction * remainder))
-            remainder -= coefficients[-1][self._label] * direction
+            products = self._of_loads.products(direction, remainder)
+            coefficients.append(global_sum(self._comm, products))
+            remainder -= self._of_loads.scale(direction, coefficients[-1])
         solutions = [solution for _, solution in self.load_directions]
         norms = self._norm_by_body(remainder)
         # A neglected remainder appears in no residual: it must be well below the tolerance of K u.
-        new = norms > 0.01 * ROUND_OFF * sizes
+        new = norms > np.maximum(0.01 * ROUND_OFF * sizes, MIN_FORCE)
         if new.any():
             is_finite = bool(np.isfinite(norms).all())
             coefficients.append(np.where(new, norms, 0.0) if is_finite else np.ones(len(new)))
             scaled = remainder
             if is_finite:
-                divisor = np.where(new, norms, 1.0)[self._label]
-                scaled = np.where(new[self._label], remainder / divisor, 0.0)
+                factors = np.where(new, 1.0 / np.where(new, norms, 1.0), 0.0)
+                scaled = self._of_loads.scale(remainder, factors)
             solutions.append(self._solve_load(scaled))
             if is_finite:
                 self.load_directions.append((scaled, solutions[-1]))
                 del self.load_directions[:-_MAX_LOAD_DIRECTIONS]
         if solutions:
-            self.particular = ParticularSolution.combine(coefficients, solutions, *self._labels)
+            self.particular = ParticularSolution.combine(coefficients, solutions, *self._partitions)
         else:
             self.particular = ParticularSolution.zero(force.size, self._unknowns.n_local)
 
-    def _sum_by_body(self, values: Array) -> Array:
-        """Sum values up by body, (n_bodies,). Collective."""
-        return global_sum(self._comm, np.bincount(self._label, values, minlength=self._n_bodies))
-
     def _norm_by_body(self, values: Array) -> Array:
         """Return the norms of forces and scaled prescribed values by body. Collective."""
-        return by_body(self._comm, [values], self._label, self._n_bodies)[0]
+        return np.asarray(norms_by_part(self._comm, [(values, self._of_loads)])[0])
 
     def _solve_load(self, direction: Array) -> ParticularSolution:
         """Return the solution for a load direction by one or two back-substitutions. Collective.
@@ -395,24 +390,22 @@ class ParticularSolution:
         cls,
         coefficients: Sequence[Array],
         solutions: Sequence[ParticularSolution],
-        label: Labels,
-        retained: Labels,
+        whole: Partition,
+        retained: Partition,
     ) -> ParticularSolution:
         """Return a linear combination of solutions with coefficients by body, (n_bodies,) each.
 
-        The labels are the bodies of all unknowns, (n_local,), and of the retained ones,
-        (n_retained,).
+        The partitions are those of all unknowns and of the retained ones.
         """
 
-        def total(parts: Sequence[Array], label: Labels) -> Array:
-            result = coefficients[0][label] * parts[0]
-            for coefficient, part in zip(coefficients[1:], parts[1:], strict=True):
-                result += coefficient[label] * part
-            return result
+        def total(parts: Sequence[Array], partition: Partition) -> Array:
+            terms = zip(parts, coefficients, strict=True)
+            first, *others = (partition.scale(part, factors) for part, factors in terms)
+            return sum(others, first)
 
         return cls(
-            total([r.field for r in solutions], label),
-            total([r.forces for r in solutions], label),
+            total([r.field for r in solutions], whole),
+            total([r.forces for r in solutions], whole),
             total([r.load for r in solutions], retained),
             total([r.prescribed_load for r in solutions], retained),
         )

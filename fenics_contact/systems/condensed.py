@@ -8,6 +8,7 @@ per increment recovers the interior.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from fenics_contact.systems.condensation import Condensation
 from fenics_contact.systems.dense import SumOperator, UpdatedLU
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
+from fenics_contact.systems.partition import Partition
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import DofSubset
 from fenics_contact.types import Array, Indices
@@ -96,8 +98,7 @@ class CondensedSystem(System):
             full.bulk,
             full.contacts,
             unknowns.gather(full.constrained[retained].astype(np.float64)) > 0.5,
-            unknowns.gather(full.label[retained].astype(np.float64)).astype(np.intp),
-            full.n_bodies,
+            unknowns.gather_partition(full.partition),
         )
         self.ready, self.scales = False, full.scales
         self.coordinate_id = object()
@@ -123,7 +124,7 @@ class CondensedSystem(System):
             self.unknowns,
             self._full.constrained,
             prefix=self._prefix,
-            label=self._full.label,
+            partition=self._full.partition,
         )
         self.coordinate_id = object()
         self.ready = True
@@ -188,6 +189,11 @@ class CondensedSystem(System):
         load = self.condensation.particular.load
         return float(0.5 * (self.bulk_force() - load) @ self.state())
 
+    @cached_property
+    def _partition_of_forces(self) -> Partition:
+        own, full = self.partition, self._full.partition
+        return Partition(np.concatenate([own.label, full.label, own.label]), own.n_parts)
+
     def forces(self, bulk: Array, reaction: Array) -> Forces:
         """Return forces at x, at p and at x again, for the prescribed values.
 
@@ -200,9 +206,8 @@ class CondensedSystem(System):
         internal = [force - particular.prescribed_load, particular.forces, x]
         external = [particular.load - particular.prescribed_load + reaction, particular.forces, x]
         unknowns = [x, particular.field, -particular.prescribed_load]
-        labels = np.concatenate([self.label, self._full.label, self.label])
         u, inner, outer = (np.concatenate(part) for part in (unknowns, internal, external))
-        return Forces(u, inner, outer, labels)
+        return Forces(u, inner, outer, self._partition_of_forces)
 
     def forget(self) -> None:
         """Drop the solutions for earlier loads."""

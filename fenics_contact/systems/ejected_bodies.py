@@ -119,7 +119,7 @@ def _measure_contact_motion(full: FullSystem, change: Array) -> Array:
     """
     scales = full.scales
     largest: Array = np.zeros(scales.n_bodies)
-    of_bodies = np.where(full.label < scales.n_bodies, change, 0.0)
+    of_bodies = np.where(full.partition.label < scales.n_bodies, change, 0.0)
     for number, operator in enumerate(full.operators):
         contact, kinematics = operator.contact, operator.contact.contact_kinematics
         length: Array = np.zeros(contact.quadrature.n_points)

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fenics_contact.types import Array, Index
+from fenics_contact.systems.partition import Partition
+from fenics_contact.types import Array
 
 __all__ = ["Forces"]
 
@@ -18,15 +19,15 @@ class Forces:
     Attributes:
         unknowns: Displacements and free motions on this rank.
         internal, external: Forces of the bulk, and loads with reactions, at the unknowns.
-        label: Body or free obstacle of every unknown.
+        partition: Bodies and free obstacles of the unknowns.
     """
 
     unknowns: Array
     internal: Array
     external: Array
-    label: Index
+    partition: Partition
 
     @classmethod
-    def zero(cls, unknowns: Array, label: Index) -> Forces:
+    def zero(cls, unknowns: Array, partition: Partition) -> Forces:
         """Return zero forces at a state."""
-        return cls(unknowns, np.zeros_like(unknowns), np.zeros_like(unknowns), label)
+        return cls(unknowns, np.zeros_like(unknowns), np.zeros_like(unknowns), partition)

@@ -18,6 +18,7 @@ from fenics_contact.surface.displacement import Displacement
 from fenics_contact.systems import linear
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.forces import Forces
+from fenics_contact.systems.partition import Partition
 from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import Unknowns
@@ -60,11 +61,12 @@ class FullSystem(System):
         self.displacement = displacement
         motions = (n + np.arange(n_motions)).astype(np.float64)
         label = unknowns.joined(dofs.astype(np.float64), motions).astype(np.intp)
-        super().__init__(u, unknowns, bulk, contacts, constrained, label, n + n_motions)
+        partition = Partition(label, n + n_motions)
+        super().__init__(u, unknowns, bulk, contacts, constrained, partition)
         mask = displacement.within(np.ones(displacement.n_owned))
         self._is_displacement: Mask = unknowns.joined(mask, np.ones(n_motions)) > 0
         self.scales = ReferenceScales(
-            displacement, body, label, self._is_displacement, n_motions, contacts
+            displacement, body, partition, self._is_displacement, n_motions, contacts
         )
         self.stiffness: PETSc.Mat | None = None
         self._near_nullspace: PETSc.NullSpace | None = None
@@ -185,7 +187,7 @@ class FullSystem(System):
 
     def forces(self, bulk: Array, reaction: Array) -> Forces:
         """Return the forces at all unknowns."""
-        return Forces(self.state(), bulk + self.load, self.load + reaction, self.label)
+        return Forces(self.state(), bulk + self.load, self.load + reaction, self.partition)
 
     def forget(self) -> None:
         """Discard the diagonal, from which round-off is estimated."""

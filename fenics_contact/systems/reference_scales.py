@@ -22,6 +22,7 @@ from fenics_contact.parallel import global_sum
 from fenics_contact.surface.displacement import Displacement
 from fenics_contact.surface.facets import facet_cells
 from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.systems.partition import Partition
 from fenics_contact.tolerances import NEGLIGIBLE, ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
@@ -37,13 +38,14 @@ class ReferenceScales:
     Args:
         displacement: The displacement within the solution function.
         body: Body of every node of this rank, ghosts last.
+        partition: Bodies and free obstacles of this rank's unknowns.
         is_displacement: Mask of the unknowns that are displacements or motions, (n_local,).
         n_motions: Number of free motions of obstacles, each of which is a part.
         contacts: Contacts of the problem.
 
     Attributes:
         n_bodies: Number of bodies.
-        label: Part of every unknown of this rank, (n_local,).
+        partition: Parts of this rank's unknowns.
         centre: Middle of the bounding box of every body, (n_bodies, gdim) (length).
         size: Diagonal of that box, (n_bodies,) (length).
         cell_size: Mean cell size, (n_bodies,) (length).
@@ -60,13 +62,16 @@ class ReferenceScales:
         self,
         displacement: Displacement,
         body: npt.NDArray[np.intp],
-        label: npt.NDArray[np.intp],
+        partition: Partition,
         is_displacement: Mask,
         n_motions: int,
         contacts: Sequence[Contact],
     ) -> None:
         space = displacement.u.function_space
-        self._comm, self.label, self._is_displacement = space.mesh.comm, label, is_displacement
+        self._comm, self.partition = space.mesh.comm, partition
+        # Other fields, such as pressures, belong to no part.
+        label = np.where(is_displacement, partition.label, -1)
+        self._of_displacements = Partition(label, partition.n_parts)
         n_bodies = self._comm.allreduce(int(body.max(initial=-1)), op=MPI.MAX) + 1
         n_owned, d = space.dofmap.index_map.size_local, space.mesh.geometry.dim
         x, own = space.tabulate_dof_coordinates()[:n_owned, :d], body[:n_owned]
@@ -114,10 +119,7 @@ class ReferenceScales:
 
         Values of other fields, such as pressures, are ignored.
         """
-        result: Array = np.zeros(len(self.group))
-        np.maximum.at(
-            result, self.label[self._is_displacement], np.abs(values[self._is_displacement])
-        )
+        result = self._of_displacements.largest(values)
         self._comm.Allreduce(MPI.IN_PLACE, result, op=MPI.MAX)
         return result[: self.n_bodies]
 
@@ -128,11 +130,11 @@ class ReferenceScales:
         self._comm.Allreduce(MPI.IN_PLACE, result, op=MPI.MAX)
         return result
 
-    def spread(self, values: Array, chosen: Mask) -> Array:
+    def spread(self, values: Array, chosen: Index) -> Array:
         """Return maximum minus minimum of chosen values of every body, (n_bodies,). Collective."""
         ends = np.full((2, len(self.group)), -np.inf)
         for end, sign in zip(ends, (1.0, -1.0), strict=True):
-            np.maximum.at(end, self.label[chosen], sign * values[chosen])
+            np.maximum.at(end, self.partition.label[chosen], sign * values[chosen])
         self._comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
         return np.maximum(ends.sum(axis=0), 0.0)[: self.n_bodies]
 
@@ -144,7 +146,7 @@ class ReferenceScales:
         self.contact_bodies = np.zeros((len(operators), self.n_bodies), dtype=np.bool_)
         all_pairs: list[Any] = [np.zeros((0, 2), dtype=np.intp)]
         for number, operator in enumerate(operators):
-            pairs = self.pairs(operator, number, self.label)
+            pairs = self.pairs(operator, number, self.partition.label)
             self.contact_bodies[number, pairs[pairs < self.n_bodies]] = True
             all_pairs.append(pairs)
         links = np.concatenate(all_pairs)

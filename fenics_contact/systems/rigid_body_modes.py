@@ -41,7 +41,8 @@ class RigidBodyModes(RigidMotions):
         Energies of the bulk tangent without conditions are relative to the stiffness of the body.
         """
         n_obstacles = self._unknowns.n_motions
-        stiffest = np.append(self._scales.stiffness, np.ones(n_obstacles))[self._scales.label]
+        stiffest = np.append(self._scales.stiffness, np.ones(n_obstacles))
+        stiffest = stiffest[self._scales.partition.label]
         rows = []
         work, image = stiffness.createVecs()
         for motion in self.of_bodies:
@@ -154,7 +155,7 @@ class RigidBodyModes(RigidMotions):
     def _bound_work(self, load: Array) -> Array:
         """Return this rank's part of a bound of the work of a load on free modes, (n_free,)."""
         # No motion displaces any dof of the undeformed bodies by more than one.
-        sizes = np.bincount(self._scales.label, np.abs(load), minlength=len(self._scales.group))
+        sizes = self._scales.partition.absolute_sums(load)
         n_obstacles, n_per_body = self._unknowns.n_motions, len(self.of_bodies)
         repeats = np.append(np.full(self._n_bodies, n_per_body), np.ones(n_obstacles, dtype=int))
         return np.asarray(np.abs(self.free) @ np.repeat(sizes, repeats))

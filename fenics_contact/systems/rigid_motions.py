@@ -83,7 +83,7 @@ class RigidMotions:
         # On the rank of the obstacles every motion of one is an unknown.
         first = self._n_bodies * n_per_body
         unknown, motion = np.nonzero(by_unknown)
-        rows = self._scales.label[unknown] * n_per_body + motion
+        rows = self._scales.partition.label[unknown] * n_per_body + motion
         rows = np.append(rows, first + np.arange(n_local - n))
         values = np.append(by_unknown[unknown, motion], np.ones(n_local - n))
         columns = np.append(unknown, np.arange(n, n_local))
@@ -142,10 +142,8 @@ class RigidMotions:
         if system is self._full:
             return self.by_body(values)
         n = self._n_bodies
-        products = [system.restrict(motion) * values for motion in self.of_bodies]
-        sums = [np.bincount(system.label, p, minlength=n)[:n] for p in products]
-        # `bincount` of an empty array is of integers.
-        return np.stack(sums, axis=1).astype(np.float64)
+        motions = (system.restrict(motion) for motion in self.of_bodies)
+        return np.stack([system.partition.products(m, values)[:n] for m in motions], axis=1)
 
     def rotate(self, coefficients: Array) -> Array:
         """Return the change of the unknowns, (n_local,), for finite motions from the present state.
@@ -205,7 +203,7 @@ class RigidMotions:
             # The jump map gives the displacement of the master side, which may be the same body.
             # Tractions at unpaired points stay unbalanced.
             jumps = np.array([operator.jump(motion) for motion in self.of_bodies])
-            difference = operator.jump(self._scales.label.astype(np.float64))[:, 0]
+            difference = operator.jump(self._scales.partition.label.astype(np.float64))[:, 0]
             paired = contact.paired[:, None]
             master = np.where(contact.paired, slave - np.rint(difference).astype(np.intp), slave)
             sides.append((master, np.where(paired, jumps - displacements, 0.0)))

@@ -12,16 +12,16 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_max
-from fenics_contact.systems.balance import InitialForces, Norms, Parts, by_body
+from fenics_contact.systems.balance import InitialForces, Norms, Parts
 from fenics_contact.systems.bulk import Bulk
 from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.systems.partition import Partition, norms_by_part
 from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array, Mask
@@ -46,7 +46,7 @@ class System(ABC):
         load: External forces at the unknowns (force).
         outside: Norms of load and round-off magnitude at unknowns outside of the system, (2,
             n_bodies).
-        label: Body or free obstacle of every unknown of this rank, (n_local,).
+        partition: Bodies and free obstacles of this rank's unknowns.
         n_bodies: Number of bodies and free obstacles.
         scales: Reference scales of the bodies.
         linear_kind: Solver of linear systems, one of `linear.KINDS`.
@@ -66,17 +66,16 @@ class System(ABC):
         bulk: Bulk,
         contacts: Sequence[Contact],
         constrained: Mask,
-        label: npt.NDArray[np.intp],
-        n_bodies: int,
+        partition: Partition,
     ) -> None:
         self.u, self.unknowns, self.bulk = u, unknowns, bulk
         self.gdim: int = u.function_space.mesh.geometry.dim
         self.contacts, self.constrained = contacts, constrained
-        self.label, self.n_bodies = label, n_bodies
+        self.partition, self.n_bodies = partition, partition.n_parts
         self.prescribed: Array = np.zeros(int(constrained.sum()))
         self.load: Array = np.zeros(unknowns.n_local)
         self._diagonal: Array | None = None  # of the matrix filled last
-        self.outside: Array = np.zeros((2, n_bodies))
+        self.outside: Array = np.zeros((2, self.n_bodies))
         self._motions = [motion for contact in contacts for motion in contact.motions]
         self._contact_vector = unknowns.vector()
         counts = [len(contact.motions) for contact in contacts]
@@ -132,11 +131,12 @@ class System(ABC):
             scales = self.scales
             parts = Parts(
                 self.unknowns.comm,
-                self.label,
+                self.partition,
+                self.constrained,
                 bodies,
                 [c.name for c in self.contacts],
                 coupled,
-                [scales.pairs(o, i, self.label) for i, o in enumerate(self.operators)],
+                [scales.pairs(o, i, self.partition.label) for i, o in enumerate(self.operators)],
                 scales,
                 [c for c, _ in moving],
             )
@@ -178,7 +178,6 @@ class System(ABC):
             contacts,
             self.load,
             self.roundoff_magnitude(self.state()),
-            self.constrained,
             self.outside,
             start,
         )
@@ -245,7 +244,7 @@ class System(ABC):
 
     def by_body(self, *vectors: Array) -> Array:
         """Return the norms of vectors by body, (n_vectors, n_bodies). Collective."""
-        return by_body(self.unknowns.comm, vectors, self.label, self.n_bodies)
+        return norms_by_part(self.unknowns.comm, [(v, self.partition) for v in vectors])
 
     def motions(self) -> Array:
         """Return the present free motions of obstacles, on every rank."""

@@ -11,6 +11,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fenics_contact.compat import create_csr_matrix
+from fenics_contact.systems.partition import Partition
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["DofSubset", "Unknowns"]
@@ -66,6 +67,11 @@ class Unknowns:
         It is the identity except for a `DofSubset`.
         """
         return values
+
+    def gather_partition(self, partition: Partition) -> Partition:
+        """Return the partition of the retained unknowns, on the first rank. Collective."""
+        label = self.gather(partition.label[self.retained].astype(np.float64))
+        return Partition(label.astype(np.intp), partition.n_parts)
 
     def scatter(self, values: Array) -> Array:
         """Invert `gather`. Collective."""
@@ -124,6 +130,11 @@ class DofSubset(Unknowns):
         result = np.zeros(self.n_local)
         self.comm.Gatherv(np.ascontiguousarray(values, dtype=np.float64), (result, self._counts))
         return result
+
+    def gather_partition(self, partition: Partition) -> Partition:
+        """Return the partition of the retained unknowns, on the first rank. Collective."""
+        label = self.gather(partition.label[self.retained].astype(np.float64))
+        return Partition(label.astype(np.intp), partition.n_parts)
 
     def scatter(self, values: Array) -> Array:
         """Scatter values from the first rank to the owners. Collective."""
