@@ -45,13 +45,12 @@ def test_tightened_joint_is_pulled_to_the_friction_limit() -> None:
             raise
 
     assert_raised_on_all_ranks(solve, fc.NotConverged, words)
-    # In the first augmentation the last method detects the overload, in 10 iterations; in the
-    # second it is the only one, with 11. How many times L-BFGS makes 20 iterations before depends
-    # on round-off.
-    tried = failed[0].attempts
-    methods = ["lbfgs", "primal_dual", "continuation", "alternating", "alternating"]
-    assert [each.method for each in tried] == methods
-    assert all(each.iterations < 20 for each in tried[3:])
+    # The fixed-point iteration detects the overload before and after the first augmentation, in 49
+    # iterations. How many times L-BFGS makes 20 iterations before depends on round-off.
+    first, *others = failed[0].attempts
+    assert first.method == "lbfgs"
+    assert {each.method for each in others} == {"alternating"}
+    assert sum(each.iterations for each in others) < 100
 
 
 def test_joint_is_tightened_if_all_points_of_head_and_nut_slip() -> None:

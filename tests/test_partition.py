@@ -39,11 +39,11 @@ def test_norms_of_huge_and_tiny_vectors():
     """No overflow or underflow at 1e±250; a vector that is not finite has no norms at all."""
     label, partition = make("scattered")
     values = np.random.default_rng(3).normal(size=label.size)
-    expected = norms_by_part(MPI.COMM_SELF, [(values, partition)])[0]
+    expected = norms_by_part(MPI.COMM_SELF, N_PARTS, [(values, partition)])[0]
     not_finite = values.copy()
     not_finite[0] = np.nan
     rows = [(1e250 * values, partition), (1e-250 * values, partition), (not_finite, partition)]
-    huge, tiny, undefined = norms_by_part(MPI.COMM_SELF, rows)
+    huge, tiny, undefined = norms_by_part(MPI.COMM_SELF, N_PARTS, rows)
     assert np.allclose(huge / 1e250, expected, rtol=1e-12)
     assert np.allclose(tiny / 1e-250, expected, rtol=1e-12)
     assert np.isnan(undefined).all()

@@ -95,12 +95,14 @@ def test_force_driven_obstacle_has_the_motion_of_newton():
     assert is_close(*motions, 1e-6)
 
 
+@pytest.mark.parametrize("supported", [False, True])
 @pytest.mark.parametrize("condensation", [False, None])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_residual_is_the_gradient_of_the_energy(cell, condensation):
+def test_residual_is_the_gradient_of_the_energy(cell, condensation, supported):
     """At a fixed friction bound the residual is the central difference of the energy, to 1e-6.
 
-    The equations are those of all dofs, or after static condensation by default.
+    The equations are those of all dofs, or after static condensation by default, without and with
+    springs against an overload.
     """
     law = fc.Coulomb(0.3, k_n=2e4, k_t=1e4)
     scene, problem, contact = loaded_block(
@@ -108,7 +110,10 @@ def test_residual_is_the_gradient_of_the_energy(cell, condensation):
     )
     problem.solve()
     problem.commit()
-    contact.effective_law.fix_friction_bound(contact.values.friction_bound)
+    support = None
+    if supported:
+        support = np.broadcast_to(3e3 * np.eye(scene.dim), (len(contact.points), *2 * [scene.dim]))
+    contact.effective_law.fix_friction_bound(contact.values.friction_bound, support)
     space = problem.solver.system
     equations = problem.solver.equations
     x = equations.solution.copy()
@@ -162,9 +167,10 @@ def test_convergence_is_linear_with_a_rate_proportional_to_friction(cell, monkey
         _, problem, contact = loaded_block(cell, law, "alternating", n=n, side=0.0)
         fix, bounds = contact.effective_law.fix_friction_bound, []
 
-        def note(bound, fix=fix, bounds=bounds):
+        def note(bound, support, fix=fix, bounds=bounds):
+            assert not support.any()
             bounds.append(bound.copy())
-            fix(bound)
+            fix(bound, support)
 
         monkeypatch.setattr(contact.effective_law, "fix_friction_bound", note)
         r = problem.solve().contacts["contact"]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 from dolfinx import fem
 
 from fenics_contact.contact.contact_kinematics import ContactKinematics, ContactParts
@@ -19,6 +22,8 @@ class EffectiveLaw:
     Attributes:
         own: The law of the contact, evaluated at the points.
         in_form: The law of the contact as expressions on Γc.
+        support: Stiffness of springs in addition to the law, (n_points, gdim, gdim)
+            (stress/length), or None.
         has_potential: Whether its tractions derive from a potential (symmetric tangent).
     """
 
@@ -30,6 +35,7 @@ class EffectiveLaw:
         self.in_form, self.own = kinematics.laws(self._active)
         self.own.prepare()
         self._effective_law = self.own
+        self.support: Array | None = None
         self._fixed_law: tuple[PointLaw, fem.Function] | None = None  # with its friction bound
         # Friction has no potential if the tangent planes rotate with u.
         self._is_rotating = kinematics.pairs_follow_bodies or (
@@ -45,12 +51,19 @@ class EffectiveLaw:
     def traction(self) -> Array:
         """Return r_n n + τ at the present ``u``, (n_points, gdim) (stress). Collective."""
         self._kinematics.update()
-        return self._effective_law.evaluate_traction()
+        traction = self._effective_law.evaluate_traction()
+        if self.support is None:
+            return traction
+        return np.asarray(traction - np.einsum("qij,qj->qi", self.support, self._increment()))
 
     def tangent(self) -> PointTangent:
         """Return the derivatives of `traction` at the present ``u``. Collective."""
         self._kinematics.update()
-        return self._kinematics.tangent(self._effective_law)
+        tangent = self._kinematics.tangent(self._effective_law)
+        if self.support is None:
+            return tangent
+        by_shift = None if tangent.by_shift is None else tangent.by_shift + self.support
+        return replace(tangent, by_jump=tangent.by_jump - self.support, by_shift=by_shift)
 
     def potential(self) -> Array:
         """Return the energy per area at the present ``u``, (n_points,) (stress·length). Collective.
@@ -58,12 +71,30 @@ class EffectiveLaw:
         Raises a ValueError if the law has no potential.
         """
         self._kinematics.update()
-        return self._effective_law.evaluate_potential()
+        potential = self._effective_law.evaluate_potential()
+        if self.support is None:
+            return potential
+        increment = self._increment()
+        energy = np.einsum("qij,qi,qj->q", self.support, increment, increment) / 2
+        return np.asarray(potential + energy)
 
-    def fix_friction_bound(self, bound: Array) -> None:
-        """Use a friction bound (n_points,) (stress), unless the law has a potential. Collective."""
+    def _increment(self) -> Array:
+        """Return the jump since the last commit, (n_points, gdim) (length). Collective."""
+        kinematics = self._kinematics
+        jump = kinematics.present_jump() - kinematics.data.values.get("obstacle", 0.0)
+        return np.asarray(jump - kinematics.committed_jump)
+
+    def fix_friction_bound(self, bound: Array, support: Array | None = None) -> None:
+        """Use a given friction bound, unless the law has a potential. Collective.
+
+        Args:
+            bound: Friction bound, (n_points,) (stress).
+            support: Stiffness of springs in addition to the law, against the jump since the last
+                commit, (n_points, gdim, gdim) (stress/length).
+        """
         if self.has_potential:
             return
+        self.support = support
         if self._fixed_law is None:
             bound_field = fem.Function(self._quadrature.space(), name="friction_bound")
             parameters = {**self.own.geometry.parameters, "friction_bound": bound_field}
@@ -75,7 +106,7 @@ class EffectiveLaw:
 
     def release_friction_bound(self) -> None:
         """Evaluate the law of the contact again."""
-        self._effective_law = self.own
+        self._effective_law, self.support = self.own, None
 
     def restrict_to(self, points: Mask | None) -> None:
         """Restrict the law to some of the points, as `Contact.restrict_to` does. Collective."""

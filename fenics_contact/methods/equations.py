@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from fenics_contact.contact.values import Status
 from fenics_contact.methods.active_set_monitor import ActiveSetMonitor
-from fenics_contact.methods.limit_analysis import Overload, find_overload
+from fenics_contact.methods.limit_analysis import Overload, find_overloads
 from fenics_contact.methods.regularisation import UnconstrainedModes
 from fenics_contact.parallel import global_max, global_sum
 from fenics_contact.systems.balance import InitialForces, Norms
@@ -163,11 +163,11 @@ class Equations:
         """Return whether the last residual is within the present tolerance, or ``rtol``."""
         return self.norms.is_within(max(self.rtol, self.augmentation_rtol, rtol))
 
-    def find_overload(self) -> Overload | None:
-        """Find an overload of friction at the last pressures, for a linear bulk. Collective."""
+    def find_overloads(self) -> list[Overload]:
+        """Find overloads of friction at the last pressures, for a linear bulk. Collective."""
         if not self._bulk.linear:  # a deformation may change loads and constraints of other bodies
-            return None
-        return find_overload(self.motions, self.full.operators, self.full.load)
+            return []
+        return find_overloads(self.motions, self.full.operators, self.full.load)
 
     # ---- matrices --------------------------------------------------------------------------------
 

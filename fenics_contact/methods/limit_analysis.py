@@ -17,14 +17,13 @@ from mpi4py import MPI
 
 from fenics_contact.parallel import broadcast_from_root, global_max, global_sum
 from fenics_contact.systems.operator import ContactOperator
+from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Index
 
-__all__ = ["CLEAR_FACTOR", "Overload", "find_overload"]
+__all__ = ["Overload", "find_overloads", "support_stiffness"]
 
-# Factor of an `Overload` from which on inexact pressures are no explanation of it.
-CLEAR_FACTOR = 1.02
 # Cutting planes, and relative tolerance of the largest overload factor.
 _MAX_PLANES, _FACTOR_TOLERANCE = 200, 1e-3
 # Bound of the coefficients, which are of order one unless friction does not resist the mode.
@@ -41,11 +40,13 @@ class Overload:
         motion: Description of the mode.
         load: Generalised load (force).
         resistance: Largest generalised friction force (force).
+        group: Group of coupled bodies, of `ReferenceScales.group`.
     """
 
     motion: str
     load: float
     resistance: float
+    group: int
 
     @property
     def factor(self) -> float:
@@ -60,13 +61,12 @@ class Overload:
         )
 
 
-def find_overload(
+def find_overloads(
     motions: RigidBodyModes, operators: Sequence[ContactOperator], load: Array
-) -> Overload | None:
-    """Find the mode along which the load exceeds the present friction limit most. Collective.
+) -> list[Overload]:
+    """Find the modes along which the load exceeds the present friction limit most. Collective.
 
-    Groups of coupled bodies are separate. If the search does not converge, the result is an
-    overload, but perhaps not the largest.
+    If the search does not converge, the result has overloads, but perhaps not the largest.
 
     Args:
         motions: The rigid-body modes.
@@ -74,19 +74,50 @@ def find_overload(
         load: External forces at this rank's unknowns (force).
 
     Returns:
-        The overload; None if friction can balance the load, or if limit analysis does not apply:
-        rotating obstacles, finite kinematics, unlimited tangential forces, or friction bounds that
-        depend on the motion.
+        The largest overload of each group of coupled bodies, the largest first. There is none if
+        friction can balance the load, or if limit analysis does not apply: rotating obstacles,
+        curved ones with an unknown motion, finite kinematics, unlimited tangential forces, or
+        friction bounds that depend on the motion.
     """
     if motions.has_obstacle_rotations:
-        return None
+        return []
     (resultant, _), groups = motions.load_resultant(load, operators), motions.groups()
     overloads: list[Overload] = []
     for group in np.unique(groups):
         overload = _find_worst(motions, operators, np.flatnonzero(groups == group), resultant)
         if overload is not None:
             overloads.append(overload)
-    return max(overloads, key=lambda overload: overload.factor) if overloads else None
+    return sorted(overloads, key=lambda overload: -overload.factor)
+
+
+def support_stiffness(
+    operators: Sequence[ContactOperator],
+    overloads: Sequence[Overload],
+    scales: ReferenceScales,
+    slip_ratio: float,
+) -> list[Array]:
+    """Return the stiffness of tangential springs that support overloaded bodies.
+
+    Bodies slide by ``slip_ratio`` of their size against them, with the present friction bound.
+    Raising the bound instead would also allow more friction across the sliding direction, and in a
+    groove reduce the pressure.
+
+    Returns:
+        For each contact, (n_points, gdim, gdim) (stress/length).
+    """
+    result = []
+    for number, operator in enumerate(operators):
+        contact, total = operator.contact, np.zeros(operator.contact.quadrature.n_points)
+        if contact.law.has_friction:
+            bound = contact.values.law_friction_bound * contact.values.circumradius
+            slip = slip_ratio * scales.size_at_points(number)
+            for overload in overloads:
+                in_group = scales.group_of_points(number) == overload.group
+                total += np.where(in_group, (overload.factor - 1.0) * bound / slip, 0.0)
+        normal = contact.values.normal
+        tangential = np.eye(normal.shape[1]) - np.einsum("qi,qj->qij", normal, normal)
+        result.append(total[:, None, None] * tangential)
+    return result
 
 
 def _find_worst(
@@ -105,6 +136,8 @@ def _find_worst(
     contacts = [contact for contact, _ in coupled]
     frictional = [c for c in contacts if c.law.has_friction]
     unlimited = any(c.law.has_tangential and not c.law.has_friction for c in contacts)
+    # The normals change with the position of a curved obstacle.
+    unlimited |= any(c.motions and not c.contact_kinematics.is_flat for c in contacts)
     unlimited |= any(c.effective_law.own.bound_depends_on_motion for c in frictional)
     if unlimited or not frictional or any(c.finite or c.law.has_tension for c in contacts):
         return None
@@ -169,4 +202,6 @@ def _find_worst(
     if worst is None or most <= 1.0:
         return None
     described = np.where(np.abs(worst) < _DESCRIBED_RATIO, 0.0, worst) @ motions.free[rows]
-    return Overload(motions.describe(described), float(load @ worst), dissipation(worst)[0])
+    name = motions.describe(described)
+    group = int(motions.groups()[rows][0])
+    return Overload(name, float(load @ worst), dissipation(worst)[0], group)

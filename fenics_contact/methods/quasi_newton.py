@@ -104,7 +104,7 @@ class QuasiNewton(SnesMethod):
             if not self._assemble_h0():
                 return iterations, compat.DIVERGED_NOT_FINITE
             stalled = stalls >= _MAX_OVERLOAD_STALLS and self.can_hand_over()
-            if stalled and equations.find_overload() is not None:
+            if stalled and equations.find_overloads():
                 return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
 
     def _assemble_first_h0(self, *, unloaded: bool) -> None:

@@ -93,7 +93,7 @@ METHODS: dict[str, type[Method]] = {
 # Methods after a failure: the first for very stiff friction, in few iterations, the second for
 # other problems. The third solved none of 420 random problems that the others failed on, but some
 # released wedges, and it detects overloads, as of an interference fit before the first
-# augmentation.
+# augmentation: it is the first if the load exceeds the friction limit under the last pressures.
 _FALLBACKS = ("primal_dual", "continuation", "alternating")
 
 
@@ -517,8 +517,14 @@ class Solver:
             self._full.evaluate()
             check_balance(self.equations.motions, self._full.load, self._full.operators)
         if fallback and self.can_fall_back():
-            others = (name for name in _FALLBACKS if name != self.method)
-            yield from (name for name in others if self.methods[name].is_applicable)
+            others = [name for name in _FALLBACKS if name != self.method]
+            others = [name for name in others if self.methods[name].is_applicable]
+            if "alternating" in others and self.equations.find_overloads():
+                yield "alternating"
+                if self.equations.overload is not None:
+                    return  # the others would fail, too, in many more iterations
+                others.remove("alternating")
+            yield from others
 
     def _describe_outcome(self, reason: int) -> str:
         """Describe the outcome of an attempt. Collective."""

@@ -5,6 +5,10 @@ Tresca or Duvaut-Lions, section 3): Newton's method with a line search on the en
 however stiff the contact is. Its pressure gives the next bound. Convergence is linear with a
 constant active set, and slower with larger friction.
 
+With an overload the subproblems have no solution. Bodies then slide against soft springs, with the
+friction of the last pressures. The overload persists if the pressures of their equilibrium, too,
+allow less friction than the load requires.
+
 The paper instead alternates between normal and tangential problems, in each of which a body that
 only contact constrains has unconstrained modes.
 """
@@ -21,8 +25,10 @@ import numpy as np
 from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
-from fenics_contact.methods.limit_analysis import CLEAR_FACTOR
+from fenics_contact.methods.equations import Equations
+from fenics_contact.methods.limit_analysis import Overload, support_stiffness
 from fenics_contact.methods.method import SnesMethod, SolverContext, StandaloneMethod
+from fenics_contact.parallel import global_max
 from fenics_contact.types import Array
 
 __all__ = ["TrescaFixedPoint"]
@@ -49,10 +55,13 @@ _MAX_STALLS = 20  # consecutive cycles without a lower residual
 # Stalled cycles after which the relaxation of the bound is halved, and its least value.
 _STALLS_TO_RELAX = 2
 _MIN_RELAXATION = 1 / 8
-# With an overload the bound is raised to this multiple of the required one, else the subproblem has
-# no solution. The overload is accepted after consecutive cycles; a clear one after the second,
-# whose pressures are in equilibrium.
-_OVERLOAD_BOUND_FACTOR, _OVERLOADS = 1.01, 3
+# First slip of overloaded bodies against springs, relative to their size, and largest deformation
+# relative to the slip. With a larger one the slip is increased tenfold: friction across the sliding
+# direction reduces the pressure in a groove (by a tenth with a deformation of a twentieth).
+_FIRST_SLIP_RATIO, _MAX_DEFORMATION_RATIO, _SLIP_GROWTH = 1e-2, 1e-2, 10.0
+# An overload is final if the balanced fraction of the load changes in a cycle by less than this
+# fraction of the missing one.
+_FINAL_CHANGE_RATIO = 0.1
 _SUBPROBLEM_RTOL = 1e-2  # residual of a subproblem relative to that of the complete law
 _SLIP_STIFFNESS_RATIO = 1e-6  # of k_t, regularises the matrix of slipping bodies
 
@@ -79,32 +88,38 @@ class TrescaFixedPoint(StandaloneMethod):
             return 0, int(_REASONS.DIVERGED_LINE_SEARCH)
         for method in (self._search, self._finish):
             method.attach(consistent=False)
-        iterations = stalls = overloads = 0
+        iterations = stalls = 0
+        last_overload: Overload | None = None
+        slip_ratio = _FIRST_SLIP_RATIO
+        slides = False
         best = np.inf
         relaxation = 1.0
         try:
             residual = self._compute_residual_norm()
             bound: Array = self._evaluate_friction_bound()
             for cycle in range(_MAX_CYCLES):
-                overload = equations.find_overload()
-                factor = overload.factor if overload else 1.0
-                overloads = overloads + 1 if 1.0 < factor < np.inf else 0
+                # Without any resistance there is no bound to support a body by.
+                overloads = [o for o in equations.find_overloads() if np.isfinite(o.factor)]
+                overload = overloads[0] if overloads else None
                 # A bound independent of the pressure does not change.
-                enough = (
-                    1 if equations.has_potential else 2 if factor > CLEAR_FACTOR else _OVERLOADS
-                )
-                if overloads >= enough:
+                final = slides and _is_final(overload, last_overload)
+                if overload and (equations.has_potential or final):
                     logger.debug("%d cycles, %d Newton iterations: overload", cycle, iterations)
                     equations.overload = overload
                     return iterations, int(_REASONS.DIVERGED_LINE_SEARCH)
-                if overloads:
-                    bound = _OVERLOAD_BOUND_FACTOR * factor * bound
+                last_overload = overload
+                full = equations.full
+                support = support_stiffness(full.operators, overloads, full.scales, slip_ratio)
                 ends = np.cumsum([c.quadrature.n_points for c in equations.contacts])[:-1]
-                for contact, part in zip(equations.contacts, np.split(bound, ends), strict=True):
-                    contact.effective_law.fix_friction_bound(part)
+                parts = zip(equations.contacts, np.split(bound, ends), support, strict=True)
+                for contact, bound_at_points, springs in parts:
+                    contact.effective_law.fix_friction_bound(bound_at_points, springs)
                 rtol = 0.0 if equations.has_potential else _SUBPROBLEM_RTOL
                 self._search.atol = self._finish.atol = rtol * residual
                 iterations += self._minimise()
+                if overload:
+                    slides = _deformation_ratio(equations, overload) <= _MAX_DEFORMATION_RATIO
+                    slip_ratio *= 1.0 if slides else _SLIP_GROWTH
                 residual = self._compute_residual_norm()
                 if equations.is_converged():
                     logger.debug("%d cycles, %d Newton iterations", cycle + 1, iterations)
@@ -173,6 +188,34 @@ class TrescaFixedPoint(StandaloneMethod):
         return iterations
 
 
+def _deformation_ratio(equations: Equations, overload: Overload) -> float:
+    """Return the deformation of overloaded bodies relative to their displacement. Collective."""
+    full, system, motions = equations.full, equations.system, equations.motions
+    change = full.state() - equations.initial_unknowns
+    rigid = motions.displacement(motions.fit_modes(change, system.restrict))
+    largest = [system.partition.largest(system.restrict(v)) for v in (change - rigid, change)]
+    in_group = full.scales.group == overload.group
+    deformation, displacement = (
+        global_max(full.unknowns.comm, values[in_group]) for values in largest
+    )
+    return deformation / displacement if displacement > 0.0 else np.inf
+
+
+def _is_final(overload: Overload | None, last: Overload | None) -> bool:
+    """Return whether the resistance has converged in consecutive cycles with an overload."""
+    if overload is None or last is None:
+        return False
+    balanced, before = 1.0 / overload.factor, 1.0 / last.factor
+    return abs(balanced - before) < _FINAL_CHANGE_RATIO * (1.0 - balanced)
+
+
+def _has_support(contact: Contact) -> bool:
+    """Return whether springs support the contact against an overload. Collective."""
+    support = contact.effective_law.support
+    size = 0.0 if support is None else np.abs(support).max(initial=0.0)
+    return global_max(contact.surface.mesh.comm, np.array([size])) > 0.0
+
+
 class _Minimisation(SnesMethod):
     """Newton's method for the subproblems, with the matrix of H₀.
 
@@ -205,9 +248,9 @@ class _Minimisation(SnesMethod):
             equations.assemble(J, equations.stiffnesses(everywhere=True))
             return
         # If all points slip, bodies constrained by friction have unconstrained modes.
+        unsupported = (o for o in equations.system.operators if not _has_support(o.contact))
         springs = (
-            o.springs(o.contact.values.springs(0.0, _SLIP_STIFFNESS_RATIO))
-            for o in equations.system.operators
+            o.springs(o.contact.values.springs(0.0, _SLIP_STIFFNESS_RATIO)) for o in unsupported
         )
         equations.assemble(J, chain(equations.tangents(), springs))
 

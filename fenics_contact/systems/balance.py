@@ -173,7 +173,7 @@ class Parts:
         for force, coupled, own in zip(contacts, self.coupled, self._partitions, strict=True):
             nodal = np.where(self.constrained[coupled], 0.0, force[coupled])
             rows += [(free[coupled], own), (nodal, own)]
-        norms = norms_by_part(self.comm, rows)
+        norms = norms_by_part(self.comm, n, rows)
         residuals, reactions, resultants, loads, terms = norms[:5]
         loads, terms = np.hypot(loads, outside[0]), np.hypot(terms, outside[1])
         local_residual, local_force = norms[5::2], norms[6::2]

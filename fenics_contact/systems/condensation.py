@@ -157,7 +157,8 @@ class Condensation:
 
     def _norm_by_body(self, values: Array) -> Array:
         """Return the norms of forces and scaled prescribed values by body. Collective."""
-        return np.asarray(norms_by_part(self._comm, [(values, self._of_loads)])[0])
+        partition = self._of_loads
+        return norms_by_part(self._comm, partition.n_parts, [(values, partition)]).ravel()
 
     def _solve_load(self, direction: Array) -> ParticularSolution:
         """Return the solution for a load direction by one or two back-substitutions. Collective.

@@ -83,13 +83,13 @@ class Partition:
         return result
 
 
-def norms_by_part(comm: MPI.Comm, rows: Sequence[tuple[Array, Partition]]) -> Array:
+def norms_by_part(comm: MPI.Comm, n_parts: int, rows: Sequence[tuple[Array, Partition]]) -> Array:
     """Return the norms of vectors by part, over all ranks, (n_vectors, n_parts). Collective.
 
     They are scaled against overflow and underflow. The norms of a vector with an entry that is not
     finite are NaN for all parts.
     """
-    local = np.array([partition.norms(values) for values, partition in rows])
+    local = np.array([partition.norms(values) for values, partition in rows]).reshape(-1, n_parts)
     largest = local.max(axis=1, initial=0.0)
     largest[np.isnan(largest)] = np.inf  # the maximum of MPI has no rule for NaN
     comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)

@@ -244,7 +244,8 @@ class System(ABC):
 
     def by_body(self, *vectors: Array) -> Array:
         """Return the norms of vectors by body, (n_vectors, n_bodies). Collective."""
-        return norms_by_part(self.unknowns.comm, [(v, self.partition) for v in vectors])
+        rows = [(vector, self.partition) for vector in vectors]
+        return norms_by_part(self.unknowns.comm, self.n_bodies, rows)
 
     def motions(self) -> Array:
         """Return the present free motions of obstacles, on every rank."""
