@@ -267,8 +267,9 @@ def draw_cost(path: Path, tables: Mapping[str, Rows]) -> None:
                     label += f" ({timing.fit(x, y)[1]:.2f})"
                 axes.loglog(x, y, style, markersize=4, label=label)
             axes.set(title=TITLES[name], xlabel="dofs", ylabel="time [s]")
+            axes.set_ylim(top=30.0 * axes.get_ylim()[1])  # the legend is above the curves
             axes.grid(alpha=0.25, which="both")
-            axes.legend(fontsize=7)
+            axes.legend(loc="upper left", fontsize=7)
 
 
 def draw_accuracy(path: Path, folder: Path) -> None:

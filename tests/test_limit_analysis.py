@@ -236,6 +236,55 @@ def test_slow_augmentations_are_continued_to_equilibrium(method):
         assert computed == pytest.approx(-load_factor * MU * force, rel=1e-6)
 
 
+def clamped_blocks(factors, **options):
+    """Return a problem of blocks that two others each clamp, side by side, and its load.
+
+    The load function sets the clamping force of every block, and its push in units of that force
+    times 2 μ, times a factor for each.
+    """
+    modulus, height, n_blocks = 1000.0, 0.5, len(factors)
+
+    def make_block(left, low, n):
+        corners = [(left, low), (left + 1.0, low + height)]
+        mesh = dolfinx.mesh.create_rectangle(MPI.COMM_WORLD, corners, (n, n))
+        ends = {1: lambda x: np.isclose(x[1], low), 2: lambda x: np.isclose(x[1], low + height)}
+        return mesh, None, tag_by_nodes(mesh, ends)
+
+    layers = {"floor": (0, 2), "block": (1, 1), "roof": (2, 3)}
+    joined = fc.join_meshes(
+        {
+            f"{name} {number}": make_block(2.0 * number, layer * height, n)
+            for number in range(n_blocks)
+            for name, (layer, n) in layers.items()
+        }
+    )
+    space = fem.functionspace(joined.mesh, ("Lagrange", 1, (2,)))
+    u, v = fem.Function(space), ufl.TestFunction(space)
+    depth, push = fem.Constant(joined.mesh, 0.0), fem.Constant(joined.mesh, 0.0)
+    x, y = ufl.SpatialCoordinate(joined.mesh)
+    bcs = []
+    F = fc.elasticity.LinearElastic(u, modulus, nu=0.0, kind="plane strain").residual(v)
+    for number, factor in enumerate(factors):
+        floor, roof = joined.facet(f"floor {number}", 1), joined.facet(f"roof {number}", 2)
+        bcs += [dirichlet_bc(u, joined.facets, tag, 0) for tag in (floor, roof)]
+        bcs += [
+            dirichlet_bc(u, joined.facets, floor, 1),
+            dirichlet_bc(u, joined.facets, roof, 1, depth),
+        ]
+        pushed = ufl.And(abs(y - 1.5 * height) < height / 2, abs(x - 2 * number - 0.5) < 1.0)
+        F -= ufl.conditional(pushed, factor * push / height, 0.0) * v[0] * ufl.dx
+    law = fc.Coulomb(MU, 100 * modulus, 100 * modulus)
+    contacts = fc.find_contact_pairs(u, law, distance=0.05, bodies=joined, **options)
+    problem = fc.ContactProblem(
+        F, u, bcs=bcs, contacts=contacts, small_displacement_tolerance=np.inf, method="newton"
+    )
+
+    def load(force, fraction):
+        depth.value, push.value = -force * 3 * height / modulus, 2 * fraction * MU * force
+
+    return problem, load
+
+
 def test_overload_of_a_clamped_block_is_reported():
     """A block constrained only by two clamping blocks is reported at 2 % above the friction limit.
 
@@ -243,46 +292,38 @@ def test_overload_of_a_clamped_block_is_reported():
     than their tolerance and by less than the missing friction. Measured: 1255 iterations; 6995 if
     the augmentations continue to the tolerance.
     """
-    modulus, height = 1000.0, 0.5
+    problem, load = clamped_blocks([1.0], enforcement="augmented", tolerance=1e-4)
+    load(10.0, 0.13)
+    problem.solve()
+    problem.commit()
+    load(1.0, 1.02)
+    with pytest.raises(fc.NotConverged, match=r"of body 2, .* the load is") as failed:
+        problem.solve()
+    assert failed.value.iterations < 1800
 
-    def make_block(low, n):
-        corners = [(0.0, low), (1.0, low + height)]
-        mesh = dolfinx.mesh.create_rectangle(MPI.COMM_WORLD, corners, (n, n))
-        ends = {1: lambda x: np.isclose(x[1], low), 2: lambda x: np.isclose(x[1], low + height)}
-        return mesh, None, tag_by_nodes(mesh, ends)
 
-    joined = fc.join_meshes(
-        {"a": make_block(0.0, 2), "b": make_block(height, 1), "c": make_block(2 * height, 3)}
-    )
-    space = fem.functionspace(joined.mesh, ("Lagrange", 1, (2,)))
-    u, v = fem.Function(space), ufl.TestFunction(space)
-    depth, push = fem.Constant(joined.mesh, 0.0), fem.Constant(joined.mesh, 0.0)
-    y = ufl.SpatialCoordinate(joined.mesh)[1]
-    pushed = ufl.conditional(abs(y - 1.5 * height) < height / 2, push / height, 0.0)
-    F = fc.elasticity.LinearElastic(u, modulus, nu=0.0, kind="plane strain").residual(v)
-    F -= pushed * v[0] * ufl.dx
-    floor, roof = joined.facet("a", 1), joined.facet("c", 2)
-    bcs = [dirichlet_bc(u, joined.facets, tag, 0) for tag in (floor, roof)]
-    bcs += [
-        dirichlet_bc(u, joined.facets, floor, 1),
-        dirichlet_bc(u, joined.facets, roof, 1, depth),
-    ]
-    law = fc.Coulomb(MU, 100 * modulus, 100 * modulus)
-    contacts = fc.find_contact_pairs(
-        u, law, distance=0.05, bodies=joined, enforcement="augmented", tolerance=1e-4
-    )
-    problem = fc.ContactProblem(
-        F, u, bcs=bcs, contacts=contacts, small_displacement_tolerance=np.inf, method="newton"
-    )
-    for force, load_factor in ((10.0, 0.13), (1.0, 1.02)):
-        depth.value, push.value = -force * 3 * height / modulus, 2 * load_factor * MU * force
-        if load_factor < 1.0:
-            problem.solve()
-            problem.commit()
-            continue
-        with pytest.raises(fc.NotConverged, match=r"of body 2, .* the load is") as failed:
-            problem.solve()
-        assert failed.value.iterations < 1800
+@pytest.mark.parametrize(
+    ("factors", "body"),
+    [([1.3, 1.1], "body 2"), ([0.5, 1.1], "body 5"), ([1.1, 1.1], "body [25]")],
+)
+def test_overloads_of_two_clamped_blocks_at_once(factors, body):
+    """The larger overload is reported, of blocks that slide independently of each other.
+
+    Reference: the limit 2 μ N of each block, to 1e-3. N is the clamping displacement by the
+    compliance of three layers of height h/E and of two contacts, 2/k_n.
+    """
+    force, height, modulus = 0.01, 0.5, 1000.0
+    problem, load = clamped_blocks(factors)
+    load(force, 0.5)
+    problem.solve()
+    problem.commit()
+    load(force, 1.0)
+    with pytest.raises(fc.NotConverged, match=rf"along x of {body}, .* the load is") as failed:
+        problem.solve()
+    stated = float(str(failed.value).split("can balance at most ")[1].split()[0])
+    compliance = 3 * height / modulus + 2 / (100 * modulus)
+    pressed = force * 3 * height / modulus / compliance
+    assert stated == pytest.approx(2 * MU * pressed, rel=1e-3)
 
 
 def groove(angle, n):
