@@ -53,10 +53,10 @@ class Verifier:
         self._warned_errors: dict[str, float] = {}
         self._warned_round_off: set[str] = set()
         self._warned_resolution: set[tuple[str, str]] = set()
-        # The pseudo-inverse serves bodies of one node, without rotations.
         # Numbers of the prescribed displacements along each axis.
         translations = motions.of_bodies[: full.gdim] != 0.0
         self._prescribed = [np.flatnonzero(moved & full.constrained) for moved in translations]
+        # The pseudo-inverse serves bodies of one node, without rotations.
         self._inverse = np.linalg.pinv(motions.gram_by_body(), hermitian=True)
 
     def verify(

@@ -294,8 +294,12 @@ class ContactKinematics(ABC):
 
     def outputs(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
         """Return the fields of `PointValues` that follow from the kinematics, not from the law."""
+        return {"jump": self.relative_jump()}
+
+    def relative_jump(self) -> Array:
+        """Return the jump of the last update relative to the obstacle, (n_points, gdim)."""
         rows = self.jump.x.array.reshape(-1, self._gdim)[: self._parts.quadrature.n_points]
-        return {"jump": rows - self.data.values.get("obstacle", 0.0)}
+        return np.asarray(rows - self.data.values.get("obstacle", 0.0))
 
     def tangent(self, law: PointLaw) -> PointTangent:
         """Return the derivatives of a law's tractions at the present state. Collective."""

@@ -79,10 +79,8 @@ class EffectiveLaw:
         return np.asarray(potential + energy)
 
     def _increment(self) -> Array:
-        """Return the jump since the last commit, (n_points, gdim) (length). Collective."""
-        kinematics = self._kinematics
-        jump = kinematics.present_jump() - kinematics.data.values.get("obstacle", 0.0)
-        return np.asarray(jump - kinematics.committed_jump)
+        """Return the jump of the last update since the last commit, (n_points, gdim) (length)."""
+        return self._kinematics.relative_jump() - self._kinematics.committed_jump
 
     def fix_friction_bound(self, bound: Array, support: Array | None = None) -> None:
         """Use a given friction bound, unless the law has a potential. Collective.

@@ -15,12 +15,13 @@ import numpy as np
 import scipy.optimize
 from mpi4py import MPI
 
+from fenics_contact.contact.values import PointValues
 from fenics_contact.parallel import broadcast_from_root, global_max, global_sum
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.reference_scales import ReferenceScales
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.tolerances import NEGLIGIBLE
-from fenics_contact.types import Array, Index
+from fenics_contact.types import Array
 
 __all__ = ["Overload", "find_overloads", "support_stiffness"]
 
@@ -84,7 +85,7 @@ def find_overloads(
     (resultant, _), groups = motions.load_resultant(load, operators), motions.groups()
     overloads: list[Overload] = []
     for group in np.unique(groups):
-        overload = _find_worst(motions, operators, np.flatnonzero(groups == group), resultant)
+        overload = _find_worst(motions, operators, int(group), resultant)
         if overload is not None:
             overloads.append(overload)
     return sorted(overloads, key=lambda overload: -overload.factor)
@@ -109,7 +110,7 @@ def support_stiffness(
     for number, operator in enumerate(operators):
         contact, total = operator.contact, np.zeros(operator.contact.quadrature.n_points)
         if contact.law.has_friction:
-            bound = contact.values.law_friction_bound * contact.values.circumradius
+            bound = _largest_friction(contact.values)
             slip = slip_ratio * scales.size_at_points(number)
             for overload in overloads:
                 in_group = scales.group_of_points(number) == overload.group
@@ -121,10 +122,11 @@ def support_stiffness(
 
 
 def _find_worst(
-    motions: RigidBodyModes, operators: Sequence[ContactOperator], rows: Index, load: Array
+    motions: RigidBodyModes, operators: Sequence[ContactOperator], group: int, load: Array
 ) -> Overload | None:
-    """Find the largest overload along the free modes ``rows`` of coupled bodies. Collective."""
-    comm, load = motions.comm, load[rows]
+    """Find the largest overload along the free modes of a group of bodies. Collective."""
+    comm, rows = motions.comm, np.flatnonzero(motions.groups() == group)
+    load = load[rows]
     size = np.abs(load).max(initial=0.0)
     if not size > 0:
         return None
@@ -136,10 +138,12 @@ def _find_worst(
     contacts = [contact for contact, _ in coupled]
     frictional = [c for c in contacts if c.law.has_friction]
     unlimited = any(c.law.has_tangential and not c.law.has_friction for c in contacts)
-    # The normals change with the position of a curved obstacle.
-    unlimited |= any(c.motions and not c.contact_kinematics.is_flat for c in contacts)
     unlimited |= any(c.effective_law.own.bound_depends_on_motion for c in frictional)
-    if unlimited or not frictional or any(c.finite or c.law.has_tension for c in contacts):
+    # Normals change with finite motions, and with the position of a curved obstacle.
+    normals_change = any(
+        c.finite or (c.motions and not c.contact_kinematics.is_flat) for c in contacts
+    )
+    if unlimited or normals_change or not frictional or any(c.law.has_tension for c in contacts):
         return None
     finite = all(
         np.isfinite(v).all()
@@ -157,8 +161,7 @@ def _find_worst(
         if contact.law.has_friction:
             tangential = modes - normal_part[:, :, None] * normal
             # Open points may close: they have the bound of the law at zero pressure.
-            bound = contact.values.law_friction_bound * contact.values.circumradius
-            sliding.append((tangential, contact.measure * bound))
+            sliding.append((tangential, contact.measure * _largest_friction(contact.values)))
     closing = np.concatenate(approaching or [np.zeros((len(load), 0))], axis=1)
 
     def dissipation(motion: Array) -> tuple[float, Array]:
@@ -202,6 +205,10 @@ def _find_worst(
     if worst is None or most <= 1.0:
         return None
     described = np.where(np.abs(worst) < _DESCRIBED_RATIO, 0.0, worst) @ motions.free[rows]
-    name = motions.describe(described)
-    group = int(motions.groups()[rows][0])
-    return Overload(name, float(load @ worst), dissipation(worst)[0], group)
+    name, resistance = motions.describe(described), dissipation(worst)[0]
+    return Overload(name, float(load @ worst), resistance, group)
+
+
+def _largest_friction(values: PointValues) -> Array:
+    """Return the largest tangential traction with the present pressures, (n_points,) (stress)."""
+    return values.law_friction_bound * values.circumradius

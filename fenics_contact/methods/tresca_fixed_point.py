@@ -101,8 +101,8 @@ class TrescaFixedPoint(StandaloneMethod):
                 # Without any resistance there is no bound to support a body by.
                 overloads = [o for o in equations.find_overloads() if np.isfinite(o.factor)]
                 overload = overloads[0] if overloads else None
-                # A bound independent of the pressure does not change.
                 final = slides and _is_final(overload, last_overload)
+                # A bound independent of the pressure does not change.
                 if overload and (equations.has_potential or final):
                     logger.debug("%d cycles, %d Newton iterations: overload", cycle, iterations)
                     equations.overload = overload

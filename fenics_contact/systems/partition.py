@@ -13,9 +13,7 @@ from mpi4py import MPI
 from fenics_contact.parallel import global_sum
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["Labels", "Partition", "norms_by_part"]
-
-Labels = npt.NDArray[np.intp]
+__all__ = ["Partition", "norms_by_part"]
 
 
 class Partition:
@@ -31,48 +29,41 @@ class Partition:
     Attributes:
         label: Part of every entry, (n,).
         n_parts: Number of parts.
+        sizes: Number of entries of every part, (n_parts,).
     """
 
-    def __init__(self, label: Labels, n_parts: int) -> None:
+    def __init__(self, label: npt.NDArray[np.intp], n_parts: int) -> None:
         self.label, self.n_parts = label, n_parts
         order = np.argsort(label, kind="stable")
         ends = np.searchsorted(label[order], np.arange(n_parts + 1))
+        self.sizes: Array = np.diff(ends).astype(np.float64)
         self._entries = [_as_slice(order[i:j]) for i, j in pairwise(ends)]
-
-    @property
-    def sizes(self) -> Array:
-        """Number of entries of every part, (n_parts,)."""
-        return self.sums(np.ones(self.label.size))
 
     def restrict(self, entries: Index | Mask) -> Partition:
         """Return the partition of some entries, given by numbers or a mask."""
         return Partition(self.label[entries], self.n_parts)
 
-    def split(self, values: Array) -> list[Array]:
+    def _split(self, values: Array) -> list[Array]:
         """Return the values of every part."""
         return [values[entries] for entries in self._entries]
 
-    def sums(self, values: Array) -> Array:
-        """Return the sums of values, (n,), by part, (n_parts,)."""
-        return np.array([part.sum() for part in self.split(values)], dtype=np.float64)
-
     def absolute_sums(self, values: Array) -> Array:
         """Return the sums of absolute values, (n,), by part, (n_parts,)."""
-        return np.array([np.abs(part).sum() for part in self.split(values)], dtype=np.float64)
+        return np.array([np.abs(part).sum() for part in self._split(values)], dtype=np.float64)
 
     def products(self, one: Array, other: Array) -> Array:
         """Return the scalar products of two vectors, (n,), by part, (n_parts,)."""
-        parts = zip(self.split(one), self.split(other), strict=True)
+        parts = zip(self._split(one), self._split(other), strict=True)
         return np.array([a @ b for a, b in parts], dtype=np.float64)
 
     def norms(self, values: Array) -> Array:
         """Return the Euclidean norms of values, (n,), by part, (n_parts,), without overflow."""
-        parts = self.split(values)
+        parts = self._split(values)
         return np.array([scipy.linalg.blas.dnrm2(p) if p.size else 0.0 for p in parts])
 
     def largest(self, values: Array) -> Array:
         """Return the largest absolute values of (n,) by part, (n_parts,)."""
-        parts = self.split(values)
+        parts = self._split(values)
         return np.array([np.abs(part).max(initial=0.0) for part in parts], dtype=np.float64)
 
     def scale(self, values: Array, factors: Array) -> Array:

@@ -68,11 +68,6 @@ class Unknowns:
         """
         return values
 
-    def gather_partition(self, partition: Partition) -> Partition:
-        """Return the partition of the retained unknowns, on the first rank. Collective."""
-        label = self.gather(partition.label[self.retained].astype(np.float64))
-        return Partition(label.astype(np.intp), partition.n_parts)
-
     def scatter(self, values: Array) -> Array:
         """Invert `gather`. Collective."""
         return values
