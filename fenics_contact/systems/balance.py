@@ -187,6 +187,11 @@ class Parts:
         bound = _MAX_DISPLACEMENT_RATIO * np.maximum(of_bodies, start.terms)
         terms = np.maximum(terms, start.terms)
         terms = np.where(fixed, terms, np.minimum(terms, bound))
+        # A load at a zero of a sine is round-off.
+        least = np.append(self.scales.min_force, np.zeros(len(self.motions)))
+        loaded = loads > np.where(fixed, _KU_ROUND_OFF * least, 0.0)
+        # A free body without load may touch an obstacle by the round-off of its position only.
+        terms = np.where(loaded | fixed, terms, np.maximum(terms, least))
         round_off = np.maximum(_KU_ROUND_OFF * terms, MIN_FORCE)
         # The softer body limits the accuracy of a contact force.
         limits = np.tile(round_off, (len(contacts), 1))
@@ -194,9 +199,6 @@ class Parts:
             for first, second in (pairs.T, pairs.T[::-1]):
                 np.minimum.at(row, first, round_off[second])
         active = local_force > np.maximum(limits, ROUND_OFF * force)
-        # A load at a zero of a sine is round-off.
-        negligible = np.append(_KU_ROUND_OFF * self.scales.min_force, np.zeros(len(self.motions)))
-        loaded = loads > np.where(fixed, negligible, 0.0)
         limited = loaded | (active.any(axis=0) & ~fixed)
         # Unloaded contact forces leave their round-off.
         unloaded = _KU_ROUND_OFF * np.maximum(start.contact - local_force, 0.0).max(
