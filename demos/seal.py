@@ -173,7 +173,7 @@ def solve(name: str, cells: int) -> Run:
 
 def under(contact: fc.Contact) -> tuple[np.ndarray, np.ndarray]:
     """Return present r and true pressure of closed points, sorted by r. Collective."""
-    r, along = contact.points[:, 0], contact.own_displacement()[:, 0]
+    r, along = contact.points[:, 0], contact.pairs.own_displacement()[:, 0]
     # The area stretches along the section and circumferentially.
     pressure = contact.pressure / (contact.area_stretch() * (1 + along / r))
     closed = contact.pressure > 0

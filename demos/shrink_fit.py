@@ -149,7 +149,7 @@ def solve(
         "references": output.compare(values, references),
         "dofs": V.dofmap.index_map.size_global * 2,
         "iterations": step.iterations,
-        "unpaired_points": contact.n_unpaired,
+        "unpaired_points": contact.pairs.n_unpaired,
         "wall_seconds": time.perf_counter() - start,
     }
     if arguments.errors:

@@ -186,7 +186,7 @@ def solve(name: str, cells: int, quarters: int) -> Run:
         run.inside.append(inside.resultants().normal_force / share)
         run.lower.append(-2 * float(output.at_node(u, (0.0, R))[1]))
         run.wider.append(2 * float(output.at_node(u, (R, 0.0))[0]))
-    x = inside.points[:, 0] + inside.own_displacement()[:, 0]
+    x = inside.points[:, 0] + inside.pairs.own_displacement()[:, 0]
     rows = MPI.COMM_WORLD.allgather(np.stack([x, inside.pressure * 2 * share]))
     run.place, run.pressure = np.concatenate(rows, axis=1)
     return run

@@ -14,6 +14,7 @@ from fenics_contact.checks.input_validation import check_prescribed_values
 from fenics_contact.checks.verdict import Verdict
 from fenics_contact.checks.verifier import Verifier
 from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.states import ContactTrial
 from fenics_contact.failure import NotConverged
 from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.first_touch import set_slip_reference_at_touch
@@ -145,7 +146,7 @@ class IncrementSolver:
         solver.system.begin(load)
         solver.equations.initial_unknowns = state.unknowns
         positioned = np.where(self.full.constrained, before, self.full.state())
-        end = set_slip_reference_at_touch(self.full, positioned, solver.linearise_end)
+        end = set_slip_reference_at_touch(solver.equations, positioned)
         solver.predictor.change = state.change
         solver.predictor.expected = end if points.end is None else points.end
         with solver.system.restricted_contacts():
@@ -167,7 +168,7 @@ class IncrementSolver:
         if (
             reason > 0
             and move_unloaded_bodies(solver.equations, part)
-            and solver.predictor.factored
+            and solver.equations.has_solution_tangent
         ):
             solver.predictor.store_converged_contacts()
         increment.attempts += attempts
@@ -245,7 +246,7 @@ class IncrementSolver:
         for contact in contacts:
             # Pairs of a body without any are searched at its complete displacement.
             unpaired = contact.contact_kinematics.can_update_pairs and not comm.allreduce(
-                int(contact.paired.any())
+                int(contact.pairs.paired.any())
             )
             if unpaired or contact.contact_kinematics.updates_pairs:
                 return False
@@ -272,6 +273,66 @@ class IncrementSolver:
             stiffnesses=[name for name in ("k_t", "k_n") if name in names],
             driven=any(m.force and not m.turns for c in self.full.contacts for m in c.motions),
         )
+
+    # ---- states ----------------------------------------------------------------------------------
+
+    def initial_state(self) -> State:
+        """Return the state of a body at rest, or that committed by another problem. Collective."""
+        unknowns, coordinate_id = self.full.state(), self.full.coordinate_id
+        zero = np.zeros_like(unknowns)
+        contacts = tuple(contact.states.committed for contact in self.full.contacts)
+        if any(state.commits for state in contacts):
+            load = self.full.present_load()
+            self.full.begin(load)
+            bulk = self.full.with_obstacles(self.full.bulk.assemble_residual())
+            forces: dict[object, Forces] = {coordinate_id: self.full.present_forces(bulk)}
+            return State(unknowns, contacts, load, EnergyState.at(forces, self.full.contacts), zero)
+        forces = {coordinate_id: Forces.zero(unknowns, self.full.partition)}
+        energy = EnergyState.unloaded(forces, self.full.contacts)
+        return State(unknowns, contacts, zero, energy, zero)
+
+    def restore(self, present: State | Trial, unknowns: Array | None = None) -> None:
+        """Set u and the contacts to those of a state, or u to ``unknowns``. Collective."""
+        self.full.set_state(present.unknowns if unknowns is None else unknowns)
+        for contact, state in zip(self.full.contacts, present.contacts, strict=True):
+            contact.states.restore(state if isinstance(state, ContactTrial) else None)
+
+    def restore_committed_pairs(self, committed: State) -> None:
+        """Restore the committed state of contacts whose pairs were replaced. Collective."""
+        for contact, state in zip(self.full.contacts, committed.contacts, strict=True):
+            follows = contact.contact_kinematics.pairs_follow_bodies
+            if not follows and contact.pairs.jump_map is not state.kinematics.pairs.jump_map:
+                contact.states.restore()
+
+    def recover_interior(
+        self, present: State | Trial, number: int
+    ) -> tuple[State | Trial, Verdict]:
+        """Recover the interior displacement of the increment solved last. Collective.
+
+        Args:
+            present: The trial state of the increment, or the committed state.
+            number: Number of the increment.
+
+        Returns:
+            The state with the interior displacement, and the verdict.
+
+        Raises:
+            NotConverged: The equations do not hold on all unknowns; u is unchanged.
+        """
+        if isinstance(present, State):
+            for contact in self.full.contacts:
+                contact.states.restore()
+        before = self.full.state()
+        self.solver.system.complete(present.interior)
+        self.full.begin(present.load)
+        verdict, forces = self.verify_system(self.full, self.full.product_force())
+        if verdict.failures:
+            self.full.set_state(before)
+            reason = int(self.solver.snes.getConvergedReason())
+            raise NotConverged(number, reason, verdict, prefix=self.prefix)
+        energy = present.energy.with_forces(self.full.coordinate_id, forces)
+        completed = replace(present, unknowns=self.full.state(), interior=None, energy=energy)
+        return completed, verdict
 
     # ---- verification ----------------------------------------------------------------------------
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,10 +11,10 @@ import ufl
 from dolfinx import fem
 from petsc4py import PETSc
 
-from fenics_contact.arguments import check_bool, is_number, listed
-from fenics_contact.checks.energy import EnergyState
+from fenics_contact.arguments import check_bool, listed
 from fenics_contact.checks.input_validation import (
     check_contacts,
+    check_tolerance,
     check_undeformed_geometry,
     find_constrained_unknowns,
     find_displacement,
@@ -29,22 +28,19 @@ from fenics_contact.methods.callbacks import defer_interrupts, release_interrupt
 from fenics_contact.methods.load_balance import find_free_modes
 from fenics_contact.methods.pair_iteration import PairIteration
 from fenics_contact.methods.solver import Settings, Solver
-from fenics_contact.parallel import global_max, raise_collectively, warn
+from fenics_contact.parallel import raise_collectively, warn
 from fenics_contact.state import State, Trial
 from fenics_contact.step import Step
+from fenics_contact.surface.displacement import Displacement
 from fenics_contact.systems import linear
 from fenics_contact.systems.bulk import Bulk
-from fenics_contact.systems.forces import Forces
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.modulus_tracking import TrackedModulus
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.unknowns import Unknowns
 from fenics_contact.types import Array
 
-__all__ = ["N_ROWS", "ContactProblem"]
-
-# Rows of `ContactProblem.committed_rows`.
-N_ROWS = 7
+__all__ = ["ContactProblem"]
 
 
 class ContactProblem:
@@ -106,10 +102,11 @@ class ContactProblem:
         u: The function that is solved for: the displacement, or a mixed function.
         displacement: The displacement as a part of u.
         contacts: The contacts.
+        full: The system on all unknowns.
+        modulus: Young's modulus at Γc, for stiffnesses that are multiples of E/h.
         motions: The rigid-body modes of the bodies, and which of them are free.
         solver: The solver of an increment: system, methods and SNES.
         accuracy: The strictest `Accuracy` of the contacts; None if any contact has none.
-        increment: Number of committed increments.
         initial_penetration: Largest penetration of the undeformed body (length), without an
             interference prescribed by ``gap``.
 
@@ -135,12 +132,7 @@ class ContactProblem:
         small_displacement_tolerance: float = 0.2,
         cross_check: bool = False,
     ) -> None:
-        tolerance = small_displacement_tolerance
-        if not (is_number(tolerance) and tolerance > 0):
-            raise ValueError(
-                f"small_displacement_tolerance is {tolerance!r}; it must be a positive relative "
-                "error, such as 0.2, or infinity to accept every increment"
-            )
+        tolerance = check_tolerance(small_displacement_tolerance)
         self.contacts = listed("contacts", contacts, Contact)
         bcs = listed("bcs", bcs, fem.DirichletBC)
         levels = [c.accuracy for c in self.contacts if c.accuracy is not None]
@@ -158,48 +150,24 @@ class ContactProblem:
             accuracy=self.accuracy,
         )
         self.displacement = find_displacement(u, self.contacts)
-        if u.function_space.mesh.comm.rank == 0:
-            linear.warn_of_slow_blas()
         self.u = u
-        bulk = Bulk(F, self.displacement)
         self._prefix, self._comm = prefix, u.function_space.mesh.comm
-        n_motions = sum(len(contact.motions) for contact in self.contacts)
-        unknowns = Unknowns(u.function_space, n_motions)
-        constrained = find_constrained_unknowns(bcs, u, unknowns, mixed=self.displacement.is_mixed)
-        check_contacts(self.contacts, self.displacement, constrained)
-        self.full = FullSystem(self.displacement, unknowns, bulk, self.contacts, constrained, bcs)
-
-        bulk.check_finite()
-        self.full.update_stiffness()
-        bulk.check_elastic()
-        modulus = TrackedModulus(bulk, self.displacement, self.contacts)
+        if self._comm.rank == 0:
+            linear.warn_of_slow_blas()
+        self.full = _create_system(F, self.displacement, self.contacts, bcs)
+        self.modulus = TrackedModulus(self.full.bulk, self.displacement, self.contacts)
         self.motions = RigidBodyModes(self.full)
         self.initial_penetration = check_undeformed_geometry(self.contacts)
         find_free_modes(self.motions, self.full)
         self.full.scales.begin(self.full.operators)
         verifier = Verifier(self.full, self.motions, tolerance=tolerance, cross_check=cross_check)
         self.solver = Solver(self.full, self.motions, settings)
-        self._increments = IncrementSolver(self.full, self.solver, verifier, modulus, prefix)
+        self._increments = IncrementSolver(self.full, self.solver, verifier, self.modulus, prefix)
         self.full.evaluate()
-        self.state = self._initial_state()
+        self.state = self._increments.initial_state()
         self._trial: Trial | None = None
         self._is_first = True  # before the first solution
         self._has_warned = False  # of an increment that was not committed
-
-    def _initial_state(self) -> State:
-        """Return the state of a body at rest, or that committed by another problem. Collective."""
-        unknowns, coordinate_id = self.full.state(), self.full.coordinate_id
-        zero = np.zeros_like(unknowns)
-        contacts = tuple(contact.states.committed for contact in self.contacts)
-        if any(state.commits for state in contacts):
-            load = self.full.present_load()
-            self.full.begin(load)
-            bulk = self.full.with_obstacles(self.full.bulk.assemble_residual())
-            forces: dict[object, Forces] = {coordinate_id: self.full.present_forces(bulk)}
-            return State(unknowns, contacts, load, EnergyState.at(forces, self.contacts), zero)
-        forces = {coordinate_id: Forces.zero(unknowns, self.full.partition)}
-        energy = EnergyState.unloaded(forces, self.contacts)
-        return State(unknowns, contacts, zero, energy, zero)
 
     @property
     def increment(self) -> int:
@@ -207,8 +175,8 @@ class ContactProblem:
         return self.state.increment
 
     @property
-    def _present(self) -> State | Trial:
-        """The state of u: the trial state if there is one, else the committed state."""
+    def present(self) -> State | Trial:
+        """The state that was solved last: the trial state if there is one, else the committed."""
         return self._trial or self.state
 
     @property
@@ -258,11 +226,6 @@ class ContactProblem:
         friction = any(c.law.has_friction for c in self.contacts)
         return self.accuracy.increments if self.accuracy and friction else 1
 
-    @property
-    def load(self) -> Array:
-        """External forces of the last solve at this rank's unknowns (force)."""
-        return self._present.load
-
     def present_state(self) -> Array:
         """Return a copy of this rank's present unknowns (length). Collective.
 
@@ -270,25 +233,6 @@ class ContactProblem:
         """
         self.complete()
         return self.full.state()
-
-    def linearised(
-        self, springs: Sequence[Array]
-    ) -> AbstractContextManager[Callable[[Sequence[Array] | None], Array]]:
-        """Solve linear systems with the tangent of the bulk and given contact stiffness.
-
-        The tangent is that of the present state. Collective.
-
-        Args:
-            springs: Stiffness at the points of every contact, (n_points, gdim, gdim)
-                (stress/length).
-
-        Returns:
-            For a ``with`` block, a collective function that returns the change of this rank's
-            unknowns due to tractions added on the body, one array (n_points, gdim) per contact, or
-            for None due to the present residual.
-        """
-        self.complete()
-        return self.solver.linearised(springs, self._present.load)
 
     # ---- solving ---------------------------------------------------------------------------------
 
@@ -317,7 +261,8 @@ class ContactProblem:
         points = PairIteration(self.full, self.contacts if updates_pairs else [])
         increment = Increment(recover_interior, points)
         self._check_committed()
-        self._check_histories()
+        for contact, state in zip(self.contacts, self.state.contacts, strict=True):
+            contact.states.check_unchanged(state)
         is_first, self._is_first = self._is_first, False
         if is_first:
             for contact in self.contacts:
@@ -327,7 +272,7 @@ class ContactProblem:
             )
             if not self.full.bulk.linear:  # u and its tangent may have changed
                 self._increments.modulus.measure()
-        incomplete = any(state.interior is not None for state in (self._present, self.state))
+        incomplete = any(state.interior is not None for state in (self.present, self.state))
         if incomplete and not self.solver.is_current():
             self._complete_all()  # before its factors are discarded
         self.solver.equations.factorisations = 0
@@ -335,11 +280,11 @@ class ContactProblem:
         # A failed iteration may leave a diagonal whose round-off would accept any residual.
         diagonal = None if self.full.bulk.linear else self.full.diagonal
         at_present = self._is_present(start_unknowns)
-        self._restore_committed_pairs()
+        self._increments.restore_committed_pairs(self.state)
 
         def reset() -> None:
             # The interior of the present state may have been recovered meanwhile.
-            self._reset_to(self._present.unknowns if at_present else start_unknowns)
+            self._increments.restore(self.present, None if at_present else start_unknowns)
             if diagonal is not None:
                 self.full.diagonal = diagonal
 
@@ -349,13 +294,13 @@ class ContactProblem:
             with np.errstate(all="ignore"):
                 while True:
                     with self.solver.options.present():
-                        result = self._increments.attempt(increment, self.state, self._present)
+                        result = self._increments.attempt(increment, self.state, self.present)
                     if not isinstance(result, Retry):
                         break
                     if result is Retry.PAIRS:
                         self._find_pairs(points)
                     reset()
-                    self._restore_committed_pairs()
+                    self._increments.restore_committed_pairs(self.state)
                     points.begin(self.contacts)
                     # After the block, in which a new SNES would take the solver's options for the
                     # user's.
@@ -377,25 +322,15 @@ class ContactProblem:
 
     def _find_pairs(self, points: PairIteration) -> None:
         """Find the opposite points in the states chosen for them. Collective."""
-        if any(state.interior is not None for state in (self._present, self.state)):
+        if any(state.interior is not None for state in (self.present, self.state)):
             # The search needs the interior, which cannot be recovered after a change of pairs.
-            self._reset_to(self._present.unknowns)
+            self._increments.restore(self.present)
             self._complete_all()
         points.find(self.state.unknowns)
 
-    def _restore_committed_pairs(self) -> None:
-        """Restore the committed state of contacts whose pairs were replaced. Collective."""
-        for contact in self.contacts:
-            pairs = contact.states.committed.kinematics.pairs
-            if (
-                not contact.contact_kinematics.pairs_follow_bodies
-                and contact.pairs.jump_map is not pairs.jump_map
-            ):
-                contact.states.restore()
-
     def _is_present(self, unknowns: Array) -> bool:
         """Whether unknowns are those of the present state. Collective."""
-        differs = not np.array_equal(unknowns, self._present.unknowns)
+        differs = not np.array_equal(unknowns, self.present.unknowns)
         return not self._comm.allreduce(int(differs))
 
     def _check_committed(self) -> None:
@@ -410,24 +345,6 @@ class ContactProblem:
             "from the same state: call commit() to accept an increment, or restore() to discard it",
         )
 
-    def _check_histories(self) -> None:
-        """Raise a ValueError if a contact was committed elsewhere since the last commit."""
-        for contact, state in zip(self.contacts, self.state.contacts, strict=True):
-            if contact.states.committed.commits != state.commits:
-                raise ValueError(
-                    f"{contact.name}: its history was committed by another problem or by "
-                    "Contact.commit() since this problem's last commit, so that this problem "
-                    "cannot continue; create a new ContactProblem with these contacts and the "
-                    "present u"
-                )
-
-    def _reset_to(self, unknowns: Array) -> None:
-        """Set u, and restore the contacts of the trial or of the last commit. Collective."""
-        self.full.set_state(unknowns)
-        trials = [None] * len(self.contacts) if self._trial is None else self._trial.contacts
-        for contact, trial in zip(self.contacts, trials, strict=True):
-            contact.states.restore(trial)
-
     def complete(self) -> Verdict | None:
         """Recover the interior displacement of the increment solved last. Collective.
 
@@ -440,23 +357,10 @@ class ContactProblem:
         Raises:
             NotConverged: The equations do not hold on all unknowns.
         """
-        present, is_committed = self._present, self._trial is None
+        present = self.present
         if present.interior is None:
             return None
-        if is_committed:
-            for contact in self.contacts:
-                contact.states.restore()
-        before = self.full.state()
-        self.solver.system.complete(present.interior)
-        self.full.begin(present.load)
-        verdict, forces = self._increments.verify_system(self.full, self.full.product_force())
-        if verdict.failures:
-            self.full.set_state(before)
-            number = self.increment + (not is_committed)
-            reason = int(self.snes.getConvergedReason())
-            raise NotConverged(number, reason, verdict, prefix=self._prefix)
-        energy = present.energy.with_forces(self.full.coordinate_id, forces)
-        completed = replace(present, unknowns=self.full.state(), interior=None, energy=energy)
+        completed, verdict = self._increments.recover_interior(present, self.state.increment + 1)
         if isinstance(completed, State):
             self.state = completed
         else:
@@ -474,7 +378,7 @@ class ContactProblem:
             self.complete()
         finally:
             self._trial = trial
-            self._reset_to(unknowns)
+            self._increments.restore(self.present, unknowns)
 
     @defer_interrupts()
     def commit(self) -> None:
@@ -518,98 +422,16 @@ class ContactProblem:
     def restore(self) -> None:
         """Discard an uncommitted increment, and reset u to the last commit. Collective."""
         self._trial = None
-        self._reset_to(self.state.unknowns)
+        self._increments.restore(self.state)
 
-    # ---- restart ---------------------------------------------------------------------------------
-
-    def committed_rows(self) -> Array:
-        """Return the committed state, from which another run can continue, as rows. Collective.
-
-        The interior displacement is recovered first, if it is out of date.
-
-        Returns:
-            Array (N_ROWS, n_local) over this rank's unknowns: their values and last change
-            (length); internal forces, external forces and the last change of the latter (force);
-            masks of the unknowns retained by static condensation, and of those with Dirichlet
-            conditions.
-
-        Raises:
-            ValueError: The present state is not that of the last commit.
-        """
-        now = self.full.state()
-        differs = self._present.interior is not self.state.interior or not np.array_equal(
-            now, self.state.unknowns
-        )
-        if self._comm.allreduce(int(differs)):
-            raise ValueError(
-                "u is not that of the last commit: an increment was not committed, or values of u "
-                "were changed; call commit() or restore() before saving the state"
-            )
-        self.complete()
-        state, forces = self.state, self.state.energy.forces[self.full.coordinate_id]
-        change = np.zeros_like(state.load) if state.change is None else state.change
-        retained = np.zeros_like(state.load)
-        if self.solver.condensed:
-            retained[self.solver.system.unknowns.retained] = 1.0
-        loads = [forces.internal, forces.external, state.load_change]
-        return np.stack([state.unknowns, change, *loads, retained, self.full.constrained])
-
-    @contextmanager
-    def at_state(self, state: Array) -> Iterator[None]:
-        """Set the unknowns to ``state`` within a ``with`` block. Collective.
-
-        With a linear bulk, stiffnesses that are multiples of E/h follow its present data within
-        the block, as in `solve`.
-        """
-        modulus = self._increments.modulus
-        before, measured = self.full.state(), modulus.present
-        try:
-            self.full.set_state(state)
-            if self.full.bulk.linear:
-                modulus.measure()
-            yield
-        finally:
-            self.full.set_state(before)
-            modulus.restore(measured)
-
-    def set_committed(
-        self,
-        rows: Array,
-        numbers: Sequence[float] | Array,
-        points: Sequence[tuple[Array, Mapping[str, Array]]],
-    ) -> None:
-        """Continue from the state that `committed_rows` returned in another run. Collective.
-
-        The loads must be those of that state.
+    def continue_from(self, state: State) -> None:
+        """Make a state of another run the committed one. Collective.
 
         Args:
-            rows: The state.
-            numbers: Number of increments, `expected_increments`, and for every contact whether its
-                pairs are to be found again.
-            points: History and values of every contact for `ContactStates.load_restart`.
+            state: The state; u and the contacts have its values.
         """
-        state, change, internal, external, load_change, retained, _ = rows
-        increment, self.expected_increments, *updates_pairs = (int(number) for number in numbers)
         self._is_first, self._trial = False, None
-        self.solver.retain_dofs(np.flatnonzero(retained).astype(np.int32))
-        self.full.set_state(state)
-        load = self.full.present_load()
-        self.full.begin(load)
-        for contact, (history, values), again in zip(
-            self.contacts, points, updates_pairs, strict=True
-        ):
-            contact.states.load_restart(history, values, updates_pairs=bool(again))
-        forces = Forces(state, internal, external, self.full.partition)
-        energy = EnergyState.at({self.full.coordinate_id: forces}, self.contacts)
-        self.state = State(
-            unknowns=state.copy(),
-            contacts=tuple(contact.states.committed for contact in self.contacts),
-            load=load,
-            energy=energy.with_committed_jumps(self.contacts),
-            change=change.copy() if global_max(self._comm, np.abs(change)) else None,
-            load_change=load_change.copy(),
-            increment=increment,
-        )
+        self.state = state
         self.restart_solver()
 
     def restart_solver(self) -> None:
@@ -618,3 +440,22 @@ class ContactProblem:
         energy, coordinate_id = self.state.energy, self.full.coordinate_id
         forces = {coordinate_id: energy.forces[coordinate_id]}
         self.state = replace(self.state, energy=replace(energy, forces=forces))
+
+
+def _create_system(
+    F: ufl.Form,
+    displacement: Displacement,
+    contacts: Sequence[Contact],
+    bcs: Sequence[fem.DirichletBC],
+) -> FullSystem:
+    """Check the input and create the system on all unknowns. Collective."""
+    bulk = Bulk(F, displacement)
+    u, n_motions = displacement.whole, sum(len(contact.motions) for contact in contacts)
+    unknowns = Unknowns(u.function_space, n_motions)
+    constrained = find_constrained_unknowns(bcs, u, unknowns, mixed=displacement.is_mixed)
+    check_contacts(contacts, displacement, constrained)
+    full = FullSystem(displacement, unknowns, bulk, contacts, constrained, bcs)
+    bulk.check_finite()
+    full.update_stiffness()
+    bulk.check_elastic()
+    return full

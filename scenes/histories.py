@@ -12,6 +12,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
+from fenics_contact.histories.restart import committed_rows
 from fenics_contact.types import Array
 from scenes.blocks import RIGHT, TOP, block
 from scenes.comparison import is_close, nodal_values, owned_values, point_values
@@ -149,7 +150,7 @@ def collect_state(history: History) -> dict[str, Array]:
     problem = history.problem
     found = {"u": _nodal(problem, problem.u), "increment": np.array([problem.increment])}
     field = fem.Function(problem.u.function_space)
-    state, _, internal, external, *_ = problem.committed_rows()
+    state, _, internal, external, *_ = committed_rows(problem)
     for name, row in (("state", state), ("internal", internal), ("external", external)):
         owned_values(field)[:] = row[: problem.full.unknowns.n_dofs]
         found[f"committed {name}"] = _nodal(problem, field)
@@ -168,7 +169,7 @@ def collect_state(history: History) -> dict[str, Array]:
             found[f"{c.name} {name}"] = point_values(c, np.column_stack([values]))
         found[f"{c.name} status"] = point_values(c, c.status)
         r = c.resultants()
-        found[f"{c.name} counts"] = np.array([r.open, r.stick, r.slip, c.n_unpaired])
+        found[f"{c.name} counts"] = np.array([r.open, r.stick, r.slip, c.pairs.n_unpaired])
         found[f"{c.name} forces"] = np.r_[r.force, r.normal_force, r.tangential_force]
     return found
 

@@ -141,7 +141,11 @@ class SceneWithUnrelatedBodies:
     def _add_unrelated(self, contacts: Sequence[fc.Contact]) -> list[fc.Contact]:
         """Apply conditions and loads of the unrelated bodies; return their contacts. Collective."""
         unrelated_contacts = []
-        finite = {"kinematics": "finite"} if any(c.finite for c in contacts) else {}
+        finite = (
+            {"kinematics": "finite"}
+            if any(c.contact_kinematics.is_finite for c in contacts)
+            else {}
+        )
         for i, body in enumerate(self.unrelated):
             name, floor = f"unrelated {i}", fc.HalfSpace((0, 0), (0, 1))
             law = fc.Coulomb(0.3)

@@ -43,7 +43,8 @@ def test_failure_leaves_no_trace(limit: str, monkeypatch: pytest.MonkeyPatch) ->
     else:
         problem.snes.setTolerances(max_it=0)
         problem.solver.main.max_it = 0
-        problem.solver.predictor.predict = False  # the predicted state can be the solution
+        # The predicted state can be the solution.
+        problem.solver.equations.has_solution_tangent = False
     scene.load(up=-30.0, side=5.0)
     words = (
         ("augmented Lagrangian method has not converged",)

@@ -30,7 +30,7 @@ def test_law_with_normal_compliance_is_solved_with_unpaired_points():
     body.prescribe(ROOF, 1, value=-5e-3)
     problem = fc.ContactProblem(body.F, body.u, bcs=body.bcs, contacts=[contact])
     step = problem.solve()
-    assert 0 < contact.n_unpaired and step.verdict.failures == []
+    assert 0 < contact.pairs.n_unpaired and step.verdict.failures == []
     assert step.contacts["contact"].normal_force > 0
 
 
@@ -68,7 +68,7 @@ def test_restart_finds_the_same_pairs_of_penetrating_bodies(release, tmp_path):
         fc.increments(resumed.problem, load(resumed), 0.0, 3.0, steps=3, checkpoint=path)
     )
     assert len(remaining) == 1
-    assert resumed.contact.n_unpaired == uninterrupted.contact.n_unpaired
+    assert resumed.contact.pairs.n_unpaired == uninterrupted.contact.pairs.n_unpaired
     assert is_close(nodal_values(resumed.u), nodal_values(uninterrupted.u), 1e-9)
     assert is_close(
         remaining[0].contacts["contact"].force, uninterrupted.contact.resultants().force, 1e-9

@@ -68,7 +68,7 @@ class UnconstrainedBlock:
         )
         assert is_close(force[[0, -1]], [-side, press], 1e-8, scale=1.0)
         comm = self.u.function_space.mesh.comm
-        place = gather(comm, self.contact.own_displacement()[:, :1]) / self.size
+        place = gather(comm, self.contact.pairs.own_displacement()[:, :1]) / self.size
         return step.iterations, place.mean()
 
 
@@ -112,7 +112,7 @@ def test_block_moves_with_the_floor_while_it_is_unloaded(displacement, bulk, kin
     scene.solve_increment(3.0, 20.0)
     scene.traction.value[:], scene.shift.value[:] = 0.0, displacement
     step = scene.problem.solve()
-    displacements = gather(COMM, scene.contact.own_displacement())
+    displacements = gather(COMM, scene.contact.pairs.own_displacement())
     assert np.abs(displacements - displacement).max() < 0.02
     assert step.iterations <= 5
 
@@ -452,7 +452,7 @@ def test_wedge_displaced_by_closing_jaws_is_not_taken_for_ejected(kinematics, sl
     problem.commit()
     shifts[0].value[0], shifts[1].value[0] = 0.1 * slope, -0.1 * slope
     problem.solve()
-    place = gather(COMM, problem.contacts[0].own_displacement())
+    place = gather(COMM, problem.contacts[0].pairs.own_displacement())
     assert np.abs(place[:, 1] - 0.1).max() < 1e-4
 
 
@@ -546,7 +546,7 @@ def test_lifted_block_moves_at_most_with_the_floor(displacement, bulk):
     for up.value, shift.value[0] in ((-0.01, 0.0), (0.05, displacement)):
         problem.solve()
         problem.commit()
-    place = gather(COMM, contact.own_displacement())[:, 0]
+    place = gather(COMM, contact.pairs.own_displacement())[:, 0]
     assert place.min() > -1e-3 * displacement and place.max() < 1.001 * displacement
 
 
@@ -709,7 +709,7 @@ class PushedBlock:
         for start, end in ((0.0, 0.85), (0.85, 0.15)):
             for along in start + (end - start) * np.arange(1, n_steps + 1) / n_steps:
                 self.step(along)
-            displacements = gather(COMM, self.contacts[0].own_displacement())
+            displacements = gather(COMM, self.contacts[0].pairs.own_displacement())
             assert np.abs(displacements - self.turn @ (0.65, 0.0)).max() < 1e-7
 
 

@@ -187,7 +187,7 @@ def test_every_error_is_listed() -> None:
     listed = {(m.module, m.line) for m in messages.read() if m.kind not in ("warning", "log")}
     missing = [text for place, text in raised_errors().items() if place not in listed]
     assert sorted(missing) == [
-        "NotConverged(number, reason, verdict, prefix=self._prefix)",
+        "NotConverged(number, reason, verdict, prefix=self.prefix)",
         "OSError(text)",
         "SystemExit(main())",
         "ValueError(f'{name}: {error}')",

@@ -492,7 +492,7 @@ def test_initial_overlap_of_several_cells_is_resolved(cell):
     # (k + modulus) l² - 0.8 k l - modulus = 0
     a, b = k + modulus, 0.8 * k
     stretch = (b + np.sqrt(b**2 + 4 * a * modulus)) / (2 * a)
-    assert contact.n_unpaired == 0
+    assert contact.pairs.n_unpaired == 0
     assert contact.resultants().normal_force == pytest.approx(k * (stretch - 0.8), rel=1e-9)
 
 

@@ -269,7 +269,7 @@ def test_moments_and_point_counts_with_finite_kinematics(tmp_path):
     points = sum(int(row[f"contact: {s} (points)"]) for s in ("open", "stick", "slip"))
     assert points == COMM.allreduce(len(setup.contact.points))
     # Reference: sum of lever arm times force; the origin is the middle of the block's bottom.
-    x = setup.contact.points + setup.contact.own_displacement()
+    x = setup.contact.points + setup.contact.pairs.own_displacement()
     force = setup.contact.measure[:, None] * setup.contact.traction
     lever = COMM.allreduce(np.sum(x[:, 0] * force[:, 1] - x[:, 1] * force[:, 0]))
     size = abs(step.contacts["contact"].normal_force)

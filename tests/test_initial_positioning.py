@@ -277,7 +277,7 @@ def test_released_block_keeps_its_position(gap, bulk):
         problem.commit()
         assert step.iterations <= 60
         assert is_close(contact.resultants().force, [0.0, press], 1e-8, scale=1.0)
-        displacements.append(contact.own_displacement()[:, 0])
+        displacements.append(contact.pairs.own_displacement()[:, 0])
     comm = scene.u.function_space.mesh.comm
     pressed, carried, released, reloaded = gather(comm, np.column_stack(displacements)).T
     assert is_close(carried - pressed, np.full(len(pressed), 5.0), 1e-9)
@@ -334,7 +334,7 @@ def test_obstacle_pushes_a_released_block(bulk):
         assert problem.solve().iterations <= 60
         problem.commit()
         assert is_close(contact.resultants().force, [0.0, press], 1e-8, scale=1.0)
-        displacements.append(contact.own_displacement()[:, 1])
+        displacements.append(contact.pairs.own_displacement()[:, 1])
     first, _, last = gather(scene.u.function_space.mesh.comm, np.column_stack(displacements)).T
     assert abs(last.mean() - first.mean() + 0.2) < 1e-2
 
@@ -461,7 +461,7 @@ def test_floor_carries_a_block_while_it_is_positioned(gap, bulk, kinematics):
         contact = scene.contact(floor, kinematics=kinematics)
         scene.problem(contact, small_displacement_tolerance=np.inf).solve()
         comm = scene.u.function_space.mesh.comm
-        place = gather(comm, contact.own_displacement())[:, 0].mean() - along
+        place = gather(comm, contact.pairs.own_displacement())[:, 0].mean() - along
         computed.append([place, contact.resultants().tangential_force])
     assert computed[0][1] > 0.1
     assert is_close(computed[1], computed[0], 1e-6)
@@ -503,7 +503,7 @@ def test_carried_block_does_not_depend_on_another_block(other, bulk, kinematics)
             counts[-1].append(problem.solve().iterations)
             problem.commit()
         comm = scene.bodies.u.function_space.mesh.comm
-        places.append(gather(comm, contacts[0].own_displacement()).mean(axis=0))
+        places.append(gather(comm, contacts[0].pairs.own_displacement()).mean(axis=0))
         assert is_close(contacts[0].resultants().force, (0.0, 0.01), 1e-8)
     assert is_close(places[1], places[0], 1e-8) and abs(places[0][0] - 0.04) < 1e-3
     assert max(counts[0]) <= 10 and max(counts[1]) <= 10
@@ -537,7 +537,7 @@ def test_positioned_block_does_not_depend_on_a_carried_block(kinematics):
                 loads["carried"].value = -0.01
             problem.solve()
             problem.commit()
-        places.append(gather(COMM, contacts[0].own_displacement()).mean(axis=0))
+        places.append(gather(COMM, contacts[0].pairs.own_displacement()).mean(axis=0))
     assert is_close(places[1], places[0], 1e-8) and places[0][1] < -0.1
 
 
@@ -592,7 +592,7 @@ def test_vertical_load_does_not_move_a_block_sideways(kinematics, n_steps, n_wal
             wall.value[0] = sign * squeeze
         problem.solve()
         problem.commit()
-        return gather(COMM, contacts[0].own_displacement())[:, 0].mean()
+        return gather(COMM, contacts[0].pairs.own_displacement())[:, 0].mean()
 
     for squeeze in (0.0, 0.01, 0.0, -gap):
         place = solve(2.0, squeeze)

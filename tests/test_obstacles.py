@@ -310,7 +310,7 @@ def test_rotation_by_more_than_a_right_angle_is_refused(shape):
         for _ in fc.increments(tool.problem, turn, steps=1, max_cuts=2):
             pass
         contact, centre = tool.contact, (0.0, tool.scene.height + 0.7)
-        x = contact.points + contact.own_displacement()
+        x = contact.points + contact.pairs.own_displacement()
         lever = np.linalg.norm(x - np.array(centre), axis=1)
         expected = COMM.allreduce(0.3 * float((contact.measure * lever) @ contact.pressure))
         allowed = 1e-9 if shape == "ball" else 1e-5

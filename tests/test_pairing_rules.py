@@ -80,7 +80,7 @@ def test_plate_is_not_paired_with_its_own_back(cell, layers):
     inner = (height > 0.04) & (height < 0.26)
     assert np.all(np.isnan(points["gap"][~inner]))
     assert is_close(points["gap"][inner], np.full(inner.sum(), 0.2), 1e-12)
-    assert contact.n_unpaired == np.count_nonzero(~inner)
+    assert contact.pairs.n_unpaired == np.count_nonzero(~inner)
 
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
@@ -103,7 +103,7 @@ def test_lifted_plates_have_no_contact_force(cell):
         up.value = height
         problem.solve()
         problem.commit()
-        assert contact.n_unpaired == 0
+        assert contact.pairs.n_unpaired == 0
         expected = 0.0 if height > 0 else sunk / (0.1 / E + 1 / k_n)
         assert is_close(contact.resultants().normal_force, expected, 1e-8, scale=1e3)
 
@@ -128,7 +128,7 @@ def test_three_plates_in_one_tag(cell):
     problem.solve()
     points = contact.gather()
     inner = (points["x"][:, -1] > 1e-6) & (points["x"][:, -1] < 0.06 - 1e-6)
-    assert contact.n_unpaired == np.count_nonzero(~inner)
+    assert contact.pairs.n_unpaired == np.count_nonzero(~inner)
     assert is_close(points["pressure"][inner], np.full(inner.sum(), q / 2), 1e-8)
     assert np.all(points["pressure"][~inner] == 0.0)
 
@@ -157,7 +157,7 @@ def test_notch_faces_are_paired_up_to_the_root(opening):
     A square of 2 × 2, cut from its right side to its middle; closed, or opened to a wedge.
     """
     contact = Bodies(cut_square(8, opening), E, 0.3).contact(FLOOR, ROOF, fc.Frictionless(1e7))
-    assert contact.n_unpaired == 0
+    assert contact.pairs.n_unpaired == 0
     points = contact.gather()
     assert np.all(points["gap"] >= -1e-12)
     assert (points["gap"].max() > 0.02) == (opening > 0)
@@ -194,7 +194,7 @@ def test_interference_deeper_than_a_cell_is_paired(cell, kinematics):
     body = stack(cell, (10, 10) if cell == "triangle" else (4, 5), (0.5, 0.5), gap=-0.2)
     contact = joint(body, 1, fc.Frictionless(1e6), kinematics=kinematics)
     contact.evaluate()
-    assert contact.n_unpaired == 0
+    assert contact.pairs.n_unpaired == 0
     gap = contact.gather()["gap"]
     assert is_close(gap, np.full(len(gap), -0.2), 1e-12)
 
@@ -207,7 +207,7 @@ def test_max_initial_penetration():
         obstacle = fc.DeformableBody(body.tags, 10 + LOWER, max_initial_penetration=release)
         with _assert_warning(unpaired, "behind"):
             contact = body.contact(10 + UPPER, obstacle, law)
-        assert (contact.n_unpaired > 0) == unpaired
+        assert (contact.pairs.n_unpaired > 0) == unpaired
     assert_raised_on_all_ranks(
         lambda: fc.DeformableBody(body.tags, 10 + LOWER, max_initial_penetration=-1.0),
         ValueError,
@@ -229,7 +229,7 @@ def test_soft_contact_keeps_its_pairs():
         down.value = -depth
         problem.solve()
         problem.commit()
-        assert contact.n_unpaired == 0
+        assert contact.pairs.n_unpaired == 0
         assert is_close(contact.resultants().normal_force, depth, 1e-4)
 
 
@@ -245,7 +245,7 @@ def overhanging_block(cell, law, *, tags=(LOWER,), gap=-0.01, **options):
     body.prescribe(ROOF, body.d - 1, value=body.lift)
     contact = joint(body, 1, law, gap=gap, **options)
     outside = np.any(np.abs(contact.gather()["x"][:, : body.d - 1] - 0.5) > 0.3, axis=1)
-    assert 0 < contact.n_unpaired == np.count_nonzero(outside)
+    assert 0 < contact.pairs.n_unpaired == np.count_nonzero(outside)
     return body, contact, outside
 
 
@@ -324,7 +324,7 @@ def test_tractions_of_unpaired_points_violate_the_laws():
     _, contact, _ = overhanging_block("triangle", fc.Frictionless(1e7))
     contact.evaluate()
     assert check_laws(contact)["complementarity"] <= 1e-12
-    contact.values.normal_traction[~contact.paired] = -1.0
+    contact.values.normal_traction[~contact.pairs.paired] = -1.0
     assert check_laws(contact)["complementarity"] > 1e-10
 
 
@@ -347,7 +347,7 @@ def test_warning_states_number_and_cause_of_unpaired_points():
         return body.contact(slave, fc.DeformableBody(body.tags, master, **options), law)
 
     with _assert_warning(False):
-        assert make_contact(UPPER, LOWER).n_unpaired == 0
+        assert make_contact(UPPER, LOWER).pairs.n_unpaired == 0
     for slave, master, options, word in (
         (UPPER, LOWER, {"search_distance": 0.05}, "search_distance"),
         (UPPER, ROOF, {}, "own body"),
@@ -355,7 +355,7 @@ def test_warning_states_number_and_cause_of_unpaired_points():
         (ROOF, FLOOR, {}, "behind"),
     ):
         with _assert_warning(True, "16 of the 16 points", word):
-            assert make_contact(slave, master, **options).n_unpaired == 16
+            assert make_contact(slave, master, **options).pairs.n_unpaired == 16
 
 
 # ---- penetration between the points --------------------------------------------------------------

@@ -48,7 +48,7 @@ def test_uniform_pressure_of_three_blocks_on_a_floor(cell, degree):
     step = problem.solve()
     assert list(step.contacts) == ["floor", "joint 1", "joint 2"]
     for contact, k in zip(contacts, stiffness, strict=True):
-        assert contact.n_unpaired == 0
+        assert contact.pairs.n_unpaired == 0
         assert is_uniform(contact.pressure, q)
         assert is_uniform(contact.gap, -q / k)
     top = fem.locate_dofs_topological(body.u.function_space.sub(up), up, body.tags.find(ROOF))
@@ -257,4 +257,4 @@ def test_pairs_are_updated_only_in_the_sliding_joint():
         assert is_close(step.contacts["joint 1"].force, [-0.2 * n, n], 1e-7)
         assert step.contacts["joint 1"].stick > 0
     assert slides.pairs.n_updates > 1 and glued.pairs.n_updates == 1
-    assert slides.n_unpaired == 0
+    assert slides.pairs.n_unpaired == 0

@@ -89,7 +89,7 @@ class Page(HTMLParser):
         # Deformed body, history of each contact and of all; 2 or 5 captions common to all contacts.
         assert len(self.pictures) == 2 + len(problem.contacts) + (2 if plane else 5)
         assert "verification passed" in self.text and "verification failed" not in self.text
-        small = any(not contact.finite for contact in problem.contacts)
+        small = any(not contact.contact_kinematics.is_finite for contact in problem.contacts)
         assert ("that displacements are small" in self.text) == small
         assert {"Verdict: holds", "Problem", "Versions"} <= self.tables.keys()
         assert ["fenics_contact", fc.__version__] in self.tables["Versions"]
@@ -97,7 +97,9 @@ class Page(HTMLParser):
             chosen = dict(self.tables[f"Contact: {contact.name}"])
             assert chosen["law"] == type(contact.law).__name__
             assert chosen["obstacle"] == type(contact.obstacle).__name__
-            assert chosen["kinematics"] == ("finite" if contact.finite else "small")
+            assert chosen["kinematics"] == (
+                "finite" if contact.contact_kinematics.is_finite else "small"
+            )
             for name, constant in contact.parameters.items():
                 value = ", ".join(f"{x:g}" for x in np.ravel(constant.value))
                 scaled = isinstance(getattr(contact.law, name, None), fc.RelativeStiffness)

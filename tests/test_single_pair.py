@@ -71,7 +71,7 @@ def test_self_contact_of_a_slit_ring_equals_its_half_on_a_plane(degree):
             contact = body.contact(FLOOR, fc.HalfSpace((0, 0), (0, 1)), fc.Frictionless(2 * k_n))
         else:
             contact = body.contact(FLOOR, ROOF, fc.Coulomb(0.3, k_n=k_n, k_t=k_n))
-            assert contact.n_unpaired == 0
+            assert contact.pairs.n_unpaired == 0
         problem = body.problem(contact)
         few, *_ = list(fc.increments(problem, squeeze, 0.0, 1e3, steps=[200.0, 1e3]))
         assert few.contacts["contact"].open > 0, "first, only a part of the lips shall touch"
@@ -147,7 +147,7 @@ def test_patch_of_very_different_cells(counts, cell, degree, swap):
     body.problem(contact).solve()
     confined = E * (1 - nu) / ((1 + nu) * (1 - 2 * nu))
     p = 0.001 / (0.1 / confined + 1 / k_n)
-    assert contact.n_unpaired == 0
+    assert contact.pairs.n_unpaired == 0
     assert is_uniform(contact.pressure, p, 1e-8)
     assert is_uniform(contact.gap, -p / k_n, 1e-8)
 
@@ -200,7 +200,7 @@ def test_torque_of_a_ring_rotated_in_a_ring(counts):
     law = fc.Coulomb(friction, k_n=k_n, k_t=1e6)
     body = rings(counts, angle=angle)
     contact = body.contact(LOWER, UPPER, law, gap=-oversize)
-    assert contact.n_unpaired == 0
+    assert contact.pairs.n_unpaired == 0
     body.set_displacement(lambda x: 0.01 * np.vstack([-x[1], x[0]]), inner)
     contact.evaluate()
     r, points = contact.resultants(), contact.gather()
@@ -243,7 +243,7 @@ def test_points_of_an_overhang_are_unpaired(cell):
     contact = joint(body, 1, fc.Coulomb(0.5, k_n=1e7, k_t=1e7))
     points = contact.gather()
     outside = np.any(np.abs(points["x"][:, :up] - 0.5) > 0.3, axis=1)
-    assert 0 < contact.n_unpaired == np.count_nonzero(outside)
+    assert 0 < contact.pairs.n_unpaired == np.count_nonzero(outside)
     problem = body.problem(contact)
     problem.solve()
     points = contact.gather()
@@ -268,6 +268,6 @@ def test_contact_without_opposite_points_has_no_force():
     contact = body.contact(UPPER, LOWER, fc.Frictionless(1e6))
     body.u.interpolate(lambda x: 0.1 * np.sin([3 * x[0] + 5 * x[1] + i for i in range(2)]))
     contact.evaluate()
-    assert contact.n_unpaired == len(contact.gather()["x"]) > 0
+    assert contact.pairs.n_unpaired == len(contact.gather()["x"]) > 0
     assert contact.resultants().normal_force == 0.0
     assert force_resultants(contact)[2] == 0.0

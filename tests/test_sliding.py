@@ -85,10 +85,10 @@ def test_points_beyond_the_edge_are_open_and_counted():
     """Points displaced beyond the end of the base have no opposite point any more."""
     setup = SlidingBlock("quadrilateral", fc.Frictionless(k_n=K_N), start=2.7)
     setup.step(0.002, 0.0)
-    assert setup.contact.n_unpaired == 0
+    assert setup.contact.pairs.n_unpaired == 0
     for along in (0.3, 0.6):
         setup.step(0.002, along)
-    assert setup.contact.n_unpaired > 0
+    assert setup.contact.pairs.n_unpaired > 0
     assert setup.contact.resultants().normal_force > 0
 
 

@@ -116,7 +116,7 @@ def test_springs_between_two_bodies(cell):
         fc.DeformableBody(tags, UPPER_FACE),
         fc.Coulomb(0.3, k_n=fc.NodalSprings(K_N), k_t=fc.NodalSprings(K_T)),
     )
-    assert contact.n_unpaired == 0
+    assert contact.pairs.n_unpaired == 0
     along = np.outer(q[:, -1], q[:, -1])
     for factors, block_of_pair in (((1, 0), K_N * along), ((0, 1), K_T * (np.eye(d) - along))):
         matrix = dense(fc.ContactOperator(contact).springs(contact.values.springs(*factors)), d)

@@ -47,7 +47,7 @@ def test_patch(cell: str, degree: int, nu: float) -> None:
     points = contact.gather()
     assert points["pressure"] == pytest.approx(np.full(len(points["pressure"]), p), rel=1e-9)
     assert points["gap"] == pytest.approx(np.full(len(points["gap"]), -p / k_n), rel=1e-9)
-    assert contact.n_unpaired == 0
+    assert contact.pairs.n_unpaired == 0
 
 
 def test_exact_contact_pressure() -> None:
@@ -130,7 +130,7 @@ def test_points_beyond_the_opposing_body_are_open() -> None:
     surface = fc.ContactSurface(mesh, tags, LOWER_FACE)
     contact = fc.Contact(u, surface, fc.DeformableBody(tags, UPPER_FACE), fc.Frictionless(k_n=1e6))
     # Of eight facets of 1/4 with two points each, four are beyond the block of width 1.
-    assert contact.n_unpaired == 8
+    assert contact.pairs.n_unpaired == 8
     x = contact.gather()["x"][:, 0]
     status = contact.gather()["status"]
     assert np.all(status[x > 1.0] == fc.Status.OPEN)
@@ -145,7 +145,7 @@ def test_search_distance_limits_pairs() -> None:
     far = fc.Contact(
         u, surface, fc.DeformableBody(tags, TOP, search_distance=0.1), fc.Frictionless(1e6)
     )
-    assert far.n_unpaired == 8
+    assert far.pairs.n_unpaired == 8
     with pytest.raises(ValueError, match="search_distance"):
         fc.DeformableBody(tags, TOP, search_distance=-1.0)
 
@@ -226,7 +226,7 @@ def test_shrink_fit() -> None:
     assert mean == pytest.approx(69.231, rel=0.005)
     # With quadratic cells of a tenth of the radius the pressure is uniform to 1 %.
     assert points["pressure"] == pytest.approx(np.full(len(points["x"]), mean), rel=0.01)
-    assert contact.n_unpaired == 0
+    assert contact.pairs.n_unpaired == 0
 
 
 @pytest.mark.parametrize("kinematics", ["small", "finite"])

@@ -178,7 +178,7 @@ def test_values_at_points_and_facets(cell, tmp_path):
     middle = points.x[:, 0].reshape(-1, per_facet, 3).mean(axis=1)
     assert is_close(facets.x[:, :corners].mean(axis=1), middle, 1e-12)
     moved = points.at_nodes["displacement"][:, 0]
-    displacements = contact.own_displacement()
+    displacements = contact.pairs.own_displacement()
     comm = contact.surface.mesh.comm
     displacements = np.concatenate(comm.allgather(np.column_stack([contact.points, displacements])))
     displacements = displacements[np.lexsort(np.round(displacements[:, :d], 9).T[::-1])][:, d:]

@@ -63,7 +63,7 @@ def rotate_disc(angle: float, steps: int, mu: float = 0.3, **options: Any) -> So
         tool, made = _press_disc(mu, method, **options)
         made += _move(tool, (0.0, -DEPTH, angle), steps)
         contact, centre = tool.contact, np.array([0.0, tool.scene.height + RADIUS - DEPTH])
-        arm = np.linalg.norm(contact.points + contact.own_displacement() - centre, axis=1)
+        arm = np.linalg.norm(contact.points + contact.pairs.own_displacement() - centre, axis=1)
         wanted = np.sign(angle) * mu * (contact.measure * arm) @ contact.pressure
         return made, relative_error(contact.moment(centre), wanted)
 

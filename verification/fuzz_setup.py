@@ -626,7 +626,7 @@ def _make_record(
                 "tangential_force": r.tangential_force,
                 "area": r.area,
                 "motion": {i: float(c.value) for i, c in contact.free_motion.items()},
-                "unpaired": contact.n_unpaired,
+                "unpaired": contact.pairs.n_unpaired,
                 "error": contact.accuracy.error if contact.accuracy else None,
                 "slip_reset": setup.slip_resets.get(contact.name),
                 "paired_at": setup.paired_at.get(contact.name),

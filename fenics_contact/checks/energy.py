@@ -144,7 +144,11 @@ class EnergyState:
                 add(3, contact.measure * contact.values.dissipated, groups)
                 # At the start the committed tractions, not the multipliers that replace them.
                 slip, normal = contact.slip_vector(), contact.values.normal
-                first = contact.values.carried_traction if contact.finite else start[0]
+                first = (
+                    contact.values.carried_traction
+                    if contact.contact_kinematics.is_finite
+                    else start[0]
+                )
                 ends = np.stack([first, end[0]])
                 sizes = contact.measure * np.linalg.norm(ends, axis=2).max(axis=0)
                 # Forces below round-off may have any direction.
@@ -182,7 +186,7 @@ def _contact_rows(contact: Contact, traction: Array) -> Array:
     units = np.eye(jump.shape[1])
     axes = [contact.contact_kinematics.rotate(np.broadcast_to(unit, jump.shape)) for unit in units]
     # Forces on the obstacle are loads, which include their work already.
-    own = contact.own_displacement()
+    own = contact.pairs.own_displacement()
     for component, motion in contact.free_motion.items():
         own[:, component] -= float(motion.value)
     rows = [traction, jump, own, *axes]

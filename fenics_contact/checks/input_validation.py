@@ -13,6 +13,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from fenics_contact import compat
+from fenics_contact.arguments import is_number
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import all_finite, gather_rows, global_max, global_min, warn
 from fenics_contact.surface.bodies import connected_bodies
@@ -26,6 +27,7 @@ from fenics_contact.wording import format_point
 __all__ = [
     "check_contacts",
     "check_prescribed_values",
+    "check_tolerance",
     "check_undeformed_geometry",
     "find_constrained_unknowns",
     "find_displacement",
@@ -43,6 +45,16 @@ _ADVICE_FOR_MIXED_FUNCTION = (
 _ADVICE_FOR_DISPLACEMENT = (
     "; use V = u.function_space, or V.sub(i) for a component: dirichletbc(value, dofs, V)"
 )
+
+
+def check_tolerance(tolerance: float) -> float:
+    """Return the small-displacement tolerance, or raise a ValueError if it is not positive."""
+    if not (is_number(tolerance) and tolerance > 0):
+        raise ValueError(
+            f"small_displacement_tolerance is {tolerance!r}; it must be a positive relative "
+            "error, such as 0.2, or infinity to accept every increment"
+        )
+    return tolerance
 
 
 def find_displacement(u: fem.Function, contacts: Sequence[Contact]) -> Displacement:

@@ -59,11 +59,11 @@ def spring_stiffness(contact: Contact) -> Array:
         slope = np.where(slips, values.friction_bound_slope, 0.0)
         ratio = slope / np.where(slips, values.friction_bound, 1.0)
         direction = normal - ratio[:, None] * contact.tangential_traction
-        k_n = np.where(status != Status.OPEN, contact.normal_stiffness, 0.0)
+        k_n = np.where(status != Status.OPEN, contact.values.normal_stiffness, 0.0)
         stiffness += k_n[:, None, None] * np.einsum("qi,qj->qij", direction, normal)
     if law.has_tangential:
         sticks = (status == Status.STICK)[:, None, None]
-        stiffness += np.where(sticks, contact.tangential_stiffness, 0.0)
+        stiffness += np.where(sticks, contact.values.tangential_stiffness, 0.0)
         stiffness += _slip_rotation_stiffness(contact)
     return stiffness
 
@@ -202,13 +202,13 @@ class Deviation:
         """Evaluate a contact; the deviation is zero where it is unknown. Collective."""
         values, closed = contact.values, contact.status != Status.OPEN
         zero, no_points = np.zeros(len(closed)), np.zeros(len(closed), dtype=np.bool_)
-        exact = contact.finite or contact.contact_kinematics.is_flat
-        if exact or not (contact.rigid or _has_moved(contact)):
+        exact = contact.contact_kinematics.is_finite or contact.contact_kinematics.is_flat
+        if exact or not (contact.contact_kinematics.is_rigid or _has_moved(contact)):
             return cls(zero, np.zeros_like(values.normal), values.normal, no_points, no_points)
         change, normal = contact.contact_kinematics.deviation(values)
-        if not contact.rigid:
+        if not contact.contact_kinematics.is_rigid:
             # It jumps from point to point; bodies respond to its smooth part on Γc.
-            paired = contact.paired & ~np.isnan(change)
+            paired = contact.pairs.paired & ~np.isnan(change)
             smooth = contact.traces(np.where(paired, change, 0.0))
             change = np.where(paired, smooth, change)
         known = np.isfinite(normal).all(axis=1)
@@ -220,10 +220,12 @@ class Deviation:
         lost = known & closed & slides & np.isnan(change)
         if contact.gap_prescribed:
             return cls(zero, normal_change, normal, lost, no_points)
-        deformed = np.where(contact.paired, values.gap, 0.0) + change
+        deformed = np.where(contact.pairs.paired, values.gap, 0.0) + change
         size = np.linalg.norm(values.x, axis=1) + contact.quadrature.facet_sizes
         tolerance = ROUND_OFF * size
-        if not contact.rigid:  # the deviation of closed points is due to faceting
+        if (
+            not contact.contact_kinematics.is_rigid
+        ):  # the deviation of closed points is due to faceting
             tolerance += max_norm(contact.surface.mesh.comm, np.nan_to_num(change[closed]))
         closing = known & ~closed & (deformed < -tolerance)
         gap = np.where(closing, deformed, 0.0)
@@ -233,7 +235,7 @@ class Deviation:
     def linearised(self, contact: Contact) -> tuple[Array, Array]:
         """Return stiffness and traction change at fixed displacements in the deformed bodies."""
         traction, values = contact.traction, contact.values
-        k_n = np.where(self.closing, contact.normal_stiffness, 0.0)
+        k_n = np.where(self.closing, contact.values.normal_stiffness, 0.0)
         added = k_n[:, None, None] * np.einsum("qi,qj->qij", self.normal, self.normal)
         lost = self.lost[:, None]
         stiffness = np.where(lost[:, None], 0.0, spring_stiffness(contact)) + added
@@ -247,9 +249,9 @@ def _has_moved(contact: Contact) -> bool:
     """Whether bodies have slid or rotated by enough for other pairs. Collective."""
     comm, values = contact.surface.mesh.comm, contact.values
     smallest = global_min(comm, contact.quadrature.facet_sizes, empty=np.inf)
-    x, u = values.x, contact.own_displacement()
+    x, u = values.x, contact.pairs.own_displacement()
     # A point without a pair may find one wherever it moves.
-    slide = max_norm(comm, np.where(contact.paired[:, None], values.slide, u))
+    slide = max_norm(comm, np.where(contact.pairs.paired[:, None], values.slide, u))
     size = max(max_norm(comm, x - global_mean(comm, x)), 1e-300)
     rotation = max_norm(comm, u - global_mean(comm, u)) / size
     return not (slide <= NEGLIGIBLE_SLIDE * smallest and rotation <= _NEGLIGIBLE_ROTATION_RATIO)
@@ -287,7 +289,7 @@ def estimate_small_displacement_error(
         change = traction_change(k, jump)
         errors = [(0.0, 0.0)] + [_relative_errors(c, g, traction, change) for g in groups]
         force, pressure = np.max(errors, axis=0).tolist()  # NaN if any is NaN
-        rough = bool(groups) and not c.rigid
+        rough = bool(groups) and not c.contact_kinematics.is_rigid
         results[c.name] = SmallDisplacementError(force, pressure, rough, *slide)
     return results
 

@@ -46,7 +46,7 @@ class ObstacleCheck:
         """Evaluate the obstacle of a contact at its evaluated state. Collective."""
         comm, closed = contact.surface.mesh.comm, contact.status != Status.OPEN
         errors, depth = contact.contact_kinematics.gradient_error(contact.values), 0.0
-        if contact.finite:
+        if contact.contact_kinematics.is_finite:
             # A NaN gap, or one without a normal, is not closed by any law.
             gap, _ = contact.contact_kinematics.true_placement(contact.values)
             errors = np.where(np.isnan(gap), np.nan, errors)
@@ -56,9 +56,8 @@ class ObstacleCheck:
         if curvature is not None and not contact.obstacle.is_flat:
             depth = global_max(comm, (contact.values.penetration * curvature)[closed])
         has_friction = contact.law.has_friction and comm.allreduce(int(closed.any())) > 0
-        angle = (
-            abs(contact.contact_kinematics.increment_angle(contact.values)) if has_friction else 0.0
-        )
+        turn = contact.contact_kinematics.rotation_in_increment(contact.values)
+        angle = abs(turn.angle) if has_friction else 0.0
         return cls(type(contact.obstacle).__name__, error, depth, angle)
 
     def conditions(self, contact: str) -> list[Condition]:

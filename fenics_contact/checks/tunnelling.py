@@ -93,7 +93,8 @@ class TunnellingCheck:
         self._contacts = [
             c
             for c in contacts
-            if not c.gap_prescribed and (not c.rigid or c.contact_kinematics.sampler is not None)
+            if not c.gap_prescribed
+            and (not c.contact_kinematics.is_rigid or c.contact_kinematics.sampler is not None)
         ]
         # The last probe of a committed state, and the last one, by contact.
         self._committed: dict[str, Any] = {}
@@ -113,7 +114,7 @@ class TunnellingCheck:
                 continue
             probe: _Probe = (
                 RigidObstacleProbe(contact, before, committed)
-                if contact.rigid
+                if contact.contact_kinematics.is_rigid
                 else OpposingBodyProbe(contact, before, committed)
             )
             probes[name] = probe

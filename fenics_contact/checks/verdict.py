@@ -312,7 +312,7 @@ def check_laws(contact: Contact) -> dict[str, float]:
     """
     comm = contact.surface.mesh.comm
     # Points without a pair have no traction.
-    law, paired, v = contact.law, contact.paired, contact.values
+    law, paired, v = contact.law, contact.pairs.paired, contact.values
     if not paired.all():
         v = v.at(paired)
 
@@ -346,7 +346,7 @@ def check_laws(contact: Contact) -> dict[str, float]:
     if not law.has_tangential:
         return errors
 
-    tau, stiffness = v.traction, contact.tangential_stiffness[paired]
+    tau, stiffness = v.traction, contact.values.tangential_stiffness[paired]
     stiffest = np.linalg.norm(stiffness, axis=(1, 2))
     if not law.has_friction:
         elastic = np.einsum("qij,qj->qi", stiffness, contact.tangential_displacement[paired])

@@ -103,9 +103,7 @@ class Contact(PointResults):
         motions: All unknown motions of the obstacle: displacements, then the angle.
         gap_prescribed: Whether the initial gap was given by ``gap``.
         kinematics: The argument.
-        finite: Whether the kinematics are finite.
         contact_kinematics: Gap, normal and jump at the points, and their committed state.
-        rigid: Whether the obstacle is rigid, so that its reactions are external forces.
         pairs: The pairs of points of Γc and opposite points.
         effective_law: The law evaluated at the points.
         states: The committed state, and the results evaluated last.
@@ -154,7 +152,7 @@ class Contact(PointResults):
             raise ValueError(f"{name}: {error}") from None
         self.accuracy = None if accuracy is None else Accuracy.of(accuracy)
         kinematics_type = select_kinematics(name, kinematics, obstacle, law, gap)
-        self.kinematics, self.finite = kinematics, kinematics_type.is_finite
+        self.kinematics, is_finite = kinematics, kinematics_type.is_finite
         augmented, self.tolerance = select_enforcement(
             name, enforcement, tolerance, law, self.accuracy
         )
@@ -171,10 +169,10 @@ class Contact(PointResults):
             degree,
             nodal=nodal,
             opposite=opposite,
-            pieces=not self.finite,
+            pieces=not is_finite,
             radius=obstacle.smallest_radius,
         )
-        has_frame = self.finite and not isinstance(obstacle, DeformableBody)
+        has_frame = is_finite and not isinstance(obstacle, DeformableBody)
         self.multipliers: Multipliers | None = None
         if augmented:
             self.multipliers = Multipliers(self.quadrature, degree, law, turning=has_frame)
@@ -215,9 +213,9 @@ class Contact(PointResults):
             multipliers=None if self.multipliers is None else self.multipliers.fields,
         )
         self.contact_kinematics: ContactKinematics = kinematics_type(parts)
-        self.rigid, self.pairs = self.contact_kinematics.is_rigid, self.contact_kinematics.pairs
+        self.pairs = self.contact_kinematics.pairs
         self.effective_law = EffectiveLaw(parts, self.contact_kinematics)
-        if not self.rigid:
+        if not self.contact_kinematics.is_rigid:
             self.contact_kinematics.update()
             self.contact_kinematics.find_pairs(None, np.zeros(self.quadrature.n_points))
         self.states = ContactStates(
@@ -256,7 +254,7 @@ class Contact(PointResults):
                 f"{self.name}: the boundary form cannot contain the unknown motion of the obstacle;"
                 " use ContactProblem, or prescribe the displacement"
             )
-        if not self.rigid:
+        if not self.contact_kinematics.is_rigid:
             raise ValueError(
                 f"{self.name}: the boundary form cannot couple Γc to the dofs of the opposing body;"
                 " use ContactProblem, or a ContactOperator"
@@ -333,30 +331,11 @@ class Contact(PointResults):
         self.inputs.update()
         self.contact_kinematics.update()
         self.states.forget()
-        self.inputs.check(self.contact_kinematics.data.values, undeformed=not self.finite)
+        self.inputs.check(
+            self.contact_kinematics.data.values, undeformed=not self.contact_kinematics.is_finite
+        )
 
     # ---- pairs -----------------------------------------------------------------------------------
-
-    @property
-    def paired(self) -> Mask:
-        """Mask of this rank's points that have an opposite point, (n_points,).
-
-        Points without one are open. On a rigid obstacle every point has one.
-        """
-        return self.pairs.paired
-
-    @property
-    def n_unpaired(self) -> int:
-        """Number of points without an opposite point, on all ranks."""
-        return self.pairs.n_unpaired
-
-    def own_displacement(self) -> Array:
-        """Return the displacement of the body of Γc at this rank's points. Collective.
-
-        Returns:
-            Array (n_points, gdim) (length).
-        """
-        return self.pairs.own_displacement()
 
     def places(self) -> Array:
         """Return the points where tractions act: X, or X + u with finite kinematics. Collective.
@@ -365,7 +344,7 @@ class Contact(PointResults):
             Array (n_points, gdim) (length).
         """
         x = self.values.x
-        return x + self.own_displacement() if self.finite else x
+        return x + self.pairs.own_displacement() if self.contact_kinematics.is_finite else x
 
     def true_placement(self) -> tuple[Array, Array]:
         """Return the gap and the normal at the deformed position X + u. Collective.
@@ -418,7 +397,8 @@ class Contact(PointResults):
         Raises:
             ValueError: The enforcement is not "augmented".
         """
-        return self._augmented().error(self.values, self.history, self.displacement_magnitude())
+        size = self.pairs.displacement_size(self.values.jump)
+        return self._augmented().error(self.values, self.history, size)
 
     def augment(self) -> float:
         """Set the multipliers to the projected tractions at the present ``u``. Collective.
@@ -435,19 +415,10 @@ class Contact(PointResults):
         """
         multipliers = self._augmented()
         self.evaluate()
-        error = multipliers.error(self.values, self.history, self.displacement_magnitude())
+        error = self.enforcement_error()
         multipliers.assign(multipliers.augmented(self.values)[1], self.values)
         self.states.forget()
         return error
-
-    def displacement_magnitude(self) -> Array:
-        """Return |u| + |⟦u⟧| at this rank's points, the scale of the jump's round-off. Collective.
-
-        Returns:
-            Array (n_points,) (length).
-        """
-        parts = self.own_displacement(), self.values.jump
-        return np.asarray(sum(np.linalg.norm(part, axis=1) for part in parts))
 
     def _augmented(self) -> Multipliers:
         """Return the multipliers, or raise a ValueError with a penalty."""

@@ -380,10 +380,6 @@ class ContactKinematics(ABC):
         arrays = self.data.values if values is None else values.arrays
         return global_max(self._mesh.comm, arrays["angle"])
 
-    def increment_angle(self, values: PointValues) -> float:
-        """Return the rotation angle of the obstacle since the last commit (radians). Collective."""
-        return self.angle(values) - self.committed_angle
-
     def rotation_derivative(self) -> Array:
         """Return ω × r at the points for a unit rotation, (n_points, gdim) (length). Collective."""
         rotation = self._parts.obstacle.rotation
@@ -412,7 +408,7 @@ class ContactKinematics(ABC):
         if rotation is None:
             return IncrementalRotation()
         about = values.arrays["about"][:1]  # equal at all points
-        return IncrementalRotation(self.increment_angle(values), about, rotation)
+        return IncrementalRotation(self.angle(values) - self.committed_angle, about, rotation)
 
     def largest_curvature(self) -> Array | None:
         """Return the largest principal curvature of a rigid obstacle at X + u (1/length).

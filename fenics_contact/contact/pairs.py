@@ -125,6 +125,15 @@ class Pairs:
                 "surface, search_distance and max_initial_penetration of the DeformableBody",
             )
 
+    def displacement_size(self, jump: Array) -> Array:
+        """Return |u| + |⟦u⟧| at the points, the scale of the round-off of the jump. Collective.
+
+        Args:
+            jump: The jump, (n_points, gdim) (length).
+        """
+        sizes = (np.linalg.norm(each, axis=1) for each in (self.own_displacement(), jump))
+        return np.asarray(sum(sizes))
+
     def state(self) -> PairsState:
         """Return a copy of the pairs."""
         distance = np.zeros(0) if self.distance is None else self.distance.x.array.copy()

@@ -89,16 +89,6 @@ class PointResults(ABC):
         return self.values.total_traction
 
     @property
-    def normal_stiffness(self) -> Array:
-        """-∂r_n/∂u_n where closed, shape (n_points,), in stress/length."""
-        return self.values.normal_stiffness
-
-    @property
-    def tangential_stiffness(self) -> Array:
-        """K_t of the law, shape (n_points, gdim, gdim), in stress/length."""
-        return self.values.tangential_stiffness
-
-    @property
     def tangential_displacement(self) -> Array:
         """Tangential displacement u_t, eq. (1), shape (n_points, gdim), in length.
 

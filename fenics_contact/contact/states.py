@@ -199,6 +199,15 @@ class ContactStates:
         self.committed = state
         self.restore()
 
+    def check_unchanged(self, state: ContactState) -> None:
+        """Raise a ValueError if another state has been committed since ``state``."""
+        if self.committed.commits != state.commits:
+            raise ValueError(
+                f"{self._name}: its history was committed by another problem or by "
+                "Contact.commit() since this problem's last commit, so that this problem cannot "
+                "continue; create a new ContactProblem with these contacts and the present u"
+            )
+
     def restore(self, trial: ContactTrial | None = None) -> None:
         """Restore history, multipliers, pairs and results of the last commit. Collective.
 

@@ -263,7 +263,7 @@ def _name_values(
 
 def _displacement(problem: ContactProblem, state: Array) -> float:
     """Return the mean displacement along the loads; without loads the largest one."""
-    comm, load = problem.u.function_space.mesh.comm, problem.load
+    comm, load = problem.u.function_space.mesh.comm, problem.present.load
     nodal = np.linalg.norm(problem.displacement.vectors(load), axis=1)
     on_obstacles = load.copy()
     on_obstacles[: problem.full.unknowns.n_dofs] = 0.0
@@ -281,6 +281,8 @@ def _linearised_errors(
 ) -> dict[str, dict[str, float]]:
     """Return the errors of enforcement, kinematics and solver in the quantities."""
     contacts, operators = problem.contacts, problem.full.operators
+    problem.complete()
+    load = problem.present.load
     springs = [spring_stiffness(contact) for contact in contacts]
     penalty_jumps = [_penalty_jump(contact) for contact in contacts]
     errors = {}
@@ -290,7 +292,7 @@ def _linearised_errors(
         tractions = [traction_change(k, jump) for k, jump in zip(springs, jumps, strict=True)]
         return _differences(problem, values, tractions, change)
 
-    with problem.linearised(springs) as solve:
+    with problem.solver.linearised(springs, load) as solve:
         errors["solver"] = differences(solve(None), [np.zeros_like(s) for s in penalty_jumps])
         # One augmentation leaves 1/(1 + k_n h/E) of the error at the shortest wavelengths, and far
         # less at the long ones that determine forces.
@@ -298,7 +300,7 @@ def _linearised_errors(
         change = solve(added)
         errors["enforcement"] = differences(change, penalty_jumps)
     deformed = [Deviation.of(contact).linearised(contact) for contact in contacts]
-    with problem.linearised([k for k, _ in deformed]) as solve:
+    with problem.solver.linearised([k for k, _ in deformed], load) as solve:
         change = solve([added for _, added in deformed])
         pairs = zip(deformed, operators, strict=True)
         tractions = [added + traction_change(k, o.jump(change)) for (k, added), o in pairs]
@@ -326,12 +328,12 @@ def _penalty_jump(contact: Contact) -> Array:
     traction = tangential - pressure[:, None] * normal
     if law.has_normal_stiffness:
         along = -np.sum(traction * normal, axis=1)
-        jump += (along / contact.normal_stiffness)[:, None] * normal
+        jump += (along / contact.values.normal_stiffness)[:, None] * normal
     if law.has_tangential:
         # K_t is made regular by any stiffness along the normal, where the traction is zero.
         along = np.einsum("q,qi,qj->qij", values.parameters["k_t"], normal, normal)
         rhs = values.tangential(traction)[:, :, None]
-        jump -= np.linalg.solve(contact.tangential_stiffness + along, rhs)[:, :, 0]
+        jump -= np.linalg.solve(contact.values.tangential_stiffness + along, rhs)[:, :, 0]
     return jump
 
 
@@ -406,7 +408,7 @@ def _discretisation_errors(
     """
     contacts, mesh = problem.contacts, problem.u.function_space.mesh
     state, twice, ratio = problem.present_state(), recovery.twice_energy, recovery.ratio
-    work = float(global_sum(mesh.comm, problem.load @ state))
+    work = float(global_sum(mesh.comm, problem.present.load @ state))
     by_loads = float(np.clip(work / twice, 0.0, 1.0)) if twice else 0.0
     by_displacements = 1.0 - by_loads
     errors: dict[str, float] = {}
@@ -430,7 +432,7 @@ def _discretisation_errors(
             friction = error * r.tangential_force / (r.normal_force or 1.0)
         peak = r.max_pressure - _smooth_peak(contact)
         errors |= _name_values(problem, contact, error, friction, peak)
-    if not np.any(global_sum(mesh.comm, np.abs(problem.load).sum())):
+    if not np.any(global_sum(mesh.comm, np.abs(problem.present.load).sum())):
         by_loads = 0.0 if _is_largest_prescribed(problem, state) else 1.0
     errors[DISPLACEMENT] = -ratio * by_loads * values[DISPLACEMENT]
     return errors

@@ -46,6 +46,7 @@ from fenics_contact.histories.point_matching import (
     split_columns,
     split_unknowns,
 )
+from fenics_contact.histories.restart import at_state, committed_rows, continue_from_rows
 from fenics_contact.parallel import collective_errors, raise_collectively
 from fenics_contact.problem import ContactProblem
 from fenics_contact.types import Array
@@ -106,7 +107,7 @@ def save(
     comm = problem.u.function_space.mesh.comm
     check_fields(problem, state_fields)
     check_places(problem)
-    rows = _convert_units(problem, problem.committed_rows())
+    rows = _convert_units(problem, committed_rows(problem))
     updated = [contact.contact_kinematics.updates_pairs for contact in problem.contacts]
     arrays = {
         "numbers": np.array(numbers, dtype=np.float64),
@@ -308,7 +309,7 @@ def load_restart(
             loads()
         for field, values_at_nodes in zip(state_fields, field_values, strict=True):
             set_nodal_values(field, values_at_nodes)
-        with problem.at_state(committed[0]):
+        with at_state(problem, committed[0]):
             differences = compare_data(stored, problem, committed, given)
         if on_mismatch == "refuse":
             refuse(
@@ -325,7 +326,7 @@ def load_restart(
         logger.warning(
             "continuing from %s with changed data: %s", stored.path, "; ".join(differences)
         )
-    problem.set_committed(committed, stored.arrays["state"], points)
+    continue_from_rows(problem, committed, stored.arrays["state"], points)
 
 
 def _convert_units(problem: ContactProblem, rows: Array, *, back: bool = False) -> Array:

@@ -13,11 +13,12 @@ from fenics_contact import compat
 from fenics_contact.contact.contact import Contact
 from fenics_contact.histories.checkpoint_file import StoredCheckpoint
 from fenics_contact.histories.point_matching import node_coordinates, split_unknowns
+from fenics_contact.histories.restart import N_ROWS
 from fenics_contact.histories.signature import signature_of_law, signature_of_obstacle
 from fenics_contact.obstacles.base import SampledObstacle
 from fenics_contact.obstacles.deformable import DeformableBody
 from fenics_contact.parallel import global_max, global_sum
-from fenics_contact.problem import N_ROWS, ContactProblem
+from fenics_contact.problem import ContactProblem
 from fenics_contact.types import Array
 
 __all__ = [
@@ -110,7 +111,11 @@ def describe_data(problem: ContactProblem) -> dict[str, str]:
         if isinstance(c.obstacle, SampledObstacle):
             switches["data"] = c.obstacle.fingerprint
         words[f"obstacle of {c.name}"] = _format_call(c.obstacle, switches)
-        if c.finite and c.rigid and not isinstance(c.obstacle, SampledObstacle):
+        if (
+            c.contact_kinematics.is_finite
+            and c.contact_kinematics.is_rigid
+            and not isinstance(c.obstacle, SampledObstacle)
+        ):
             # With small displacements only its values on Γc matter; they are compared as numbers.
             code = signature_of_obstacle(c.obstacle, gdim)
             words[f"code (UFL) of the obstacle of {c.name}"] = code

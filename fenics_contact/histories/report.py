@@ -307,7 +307,10 @@ def _choose_magnification(problem: ContactProblem) -> float:
     u, comm = problem.displacement.u, problem.u.function_space.mesh.comm
     largest = global_max(comm, np.abs(u.x.array))
     size = problem.full.scales.mesh_size
-    if any(contact.finite for contact in problem.contacts) or not largest > _ROUND_OFF_RATIO * size:
+    if (
+        any(contact.contact_kinematics.is_finite for contact in problem.contacts)
+        or not largest > _ROUND_OFF_RATIO * size
+    ):
         return 1.0
     upper_bound = _MAGNIFIED_RATIO * size / largest
     power = 10.0 ** np.floor(np.log10(upper_bound))
@@ -333,7 +336,9 @@ def _add_state(
         checked += ["the contact laws at every point"] if step.verdict.laws else []
         checked += ["the penetration left by multipliers"] if step.verdict.enforcement else []
         checked += ["the rigid obstacles"] if step.verdict.obstacles else []
-        small = [c.name for c in problem.contacts if not c.finite]  # small displacements
+        small = [
+            c.name for c in problem.contacts if not c.contact_kinematics.is_finite
+        ]  # small displacements
         known = step.verdict.small_displacement_error
         checked += ["that displacements are small"] if any(n in known for n in small) else []
         residual = f"The residual is {step.verdict.relative_residual:.1e} of the forces."
@@ -495,7 +500,7 @@ def _add_settings(page: _Page, problem: ContactProblem, step: Step) -> None:
         ("attempts of the last increment", "; ".join(map(str, step.attempts))),
         ("accuracy", "not given" if problem.accuracy is None else str(problem.accuracy)),
     ]
-    if not all(contact.finite for contact in problem.contacts):
+    if not all(contact.contact_kinematics.is_finite for contact in problem.contacts):
         rows.append(
             (
                 "tolerance of the small-displacement error",

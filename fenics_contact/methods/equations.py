@@ -58,6 +58,7 @@ class Equations:
         function: Vector for the residual.
         solvers: Linear solvers for H₀ (False) and the consistent tangent (True).
         valid_matrices: Which of their matrices are assembled for a present state.
+        has_solution_tangent: Whether the factored consistent tangent is that of a solution.
         is_h0_current: Whether H₀ is that of `assemble_h0` or of a later status; if False, it is
             assembled before its next use.
         uses_v_cycle: Whether H₀ is a multigrid V-cycle, with one matrix for H₀ and the tangent.
@@ -89,7 +90,7 @@ class Equations:
         self.overload: Overload | None = None
         self._matrices: dict[bool, PETSc.Mat] = {}
         self.valid_matrices: set[bool] = set()
-        self.is_h0_current = False
+        self.is_h0_current = self.has_solution_tangent = False
         self.system: System = full
         self.initial_unknowns = full.state()
         self.is_round_off_known = False
@@ -194,7 +195,7 @@ class Equations:
         self._matrices, self.valid_matrices, self.hierarchy = {}, set(), Hierarchy()
         for ksp in self.solvers.values():
             ksp.reset()
-        self.is_h0_current = False
+        self.is_h0_current = self.has_solution_tangent = False
 
     def assemble_h0(self, *, everywhere: bool) -> None:
         """Assemble the symmetric H₀ = K + αK_n + φK_t (section 5), by `stiffnesses`. Collective."""
@@ -206,6 +207,7 @@ class Equations:
         filled = {c for c, m in self._matrices.items() if m.handle == matrix.handle}
         if True in filled:  # reset before the generator ``contacts`` may set them
             self.regularised_modes = np.zeros((0, 0))
+            self.has_solution_tangent = False
         self.factorisations += self.system.fill(matrix, contacts)
         self.is_round_off_known = True
         if self.system.pattern_changes:

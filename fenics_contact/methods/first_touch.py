@@ -5,7 +5,7 @@ A contact on several groups of coupled bodies is divided into one part per group
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,8 @@ import scipy.optimize
 from mpi4py import MPI
 
 from fenics_contact.contact.contact import Contact
+from fenics_contact.methods.equations import Equations
+from fenics_contact.methods.linearised_solve import linearise_end
 from fenics_contact.parallel import global_max, global_min
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.types import Array, Mask
@@ -22,25 +24,19 @@ __all__ = ["set_slip_reference_at_touch"]
 _TOUCHING_GAP_RATIO = 1e-6  # least gap at first touch, relative to the initial one
 
 
-def set_slip_reference_at_touch(
-    full: FullSystem,
-    start: Array,
-    linearise_end: Callable[[Sequence[tuple[Contact, Mask]], Array], Array | None],
-) -> Array | None:
+def set_slip_reference_at_touch(equations: Equations, start: Array) -> Array | None:
     """Set the slip reference of contacts that are apart initially to first touch. Collective.
 
     Until first touch the bodies move without these contacts, on a straight path for a linear bulk.
 
     Args:
-        full: The system on all unknowns.
+        equations: The equations of the increment.
         start: The state at the start of the increment, with the prescribed values of that time.
-        linearise_end: Compute the state at the end of the increment with contacts restricted to
-            some of their points; None if nothing else constrains the bodies.
 
     Returns:
         The state at the end if nothing touches; None if something does, or no contact is apart.
     """
-    comm = full.unknowns.comm
+    full, comm = equations.full, equations.full.unknowns.comm
     parts = [part for part in _divide_contacts(full) if part.is_unloaded(comm)]
     if not parts:
         return None
@@ -51,7 +47,8 @@ def set_slip_reference_at_touch(
         (p, offset) for p, offset in zip(parts, offsets, strict=True) if p.is_apart(comm, offset)
     ]
     full.set_state(present)
-    end = linearise_end(_exclude([part for part, _ in apart]), start) if apart else None
+    acting = _exclude([part for part, _ in apart])
+    end = linearise_end(equations, acting, start) if apart else None
     expected = None
     if end is not None:
         paths = [_Path(full, *pair, start, end) for pair in apart]
@@ -106,7 +103,7 @@ class _Part:
         contact = self.contact
         with contact.contact_kinematics.displaced(offset):
             contact.evaluate()
-        return np.where(contact.paired & self.points, contact.values.gap, np.inf)
+        return np.where(contact.pairs.paired & self.points, contact.values.gap, np.inf)
 
 
 def _divide_contacts(full: FullSystem) -> list[_Part]:

@@ -91,7 +91,7 @@ class InitialPositioning:
         if not len(motions.free):
             return first
         full.evaluate()
-        finite = all(contact.finite for contact in full.contacts)
+        finite = all(contact.contact_kinematics.is_finite for contact in full.contacts)
         groups, load_size = motions.groups(), motions.generalised_load(self.load)
         contact_force = full.contact_force_sizes(committed=finite)
         unloaded = (contact_force < UNLOADED_FORCE_RATIO * load_size)[groups] & (not first)
@@ -161,8 +161,8 @@ class InitialPositioning:
             zip(self.full.contacts, self._at_points(modes), obstacles, strict=True)
         ):
             touches = contact.values.opening <= FLAT * scales.size_at_points(number)
-            weights = np.where(contact.paired & touches, contact.measure, 0.0)
-            displacement = motion.of_points(contact.own_displacement())
+            weights = np.where(contact.pairs.paired & touches, contact.measure, 0.0)
+            displacement = motion.of_points(contact.pairs.own_displacement())
             gram += np.einsum("mqd,q,nqd->mn", jumps, weights, jumps)
             work += np.einsum("mqd,q,qd->m", jumps, weights, displacement)
         comm = self.full.unknowns.comm
@@ -253,13 +253,15 @@ class InitialPositioning:
         if free is None:
             return False
         gaps = [
-            np.abs(c.values.gap[c.paired & _find_displaced(jumps)]).max(initial=0.0)
+            np.abs(c.values.gap[c.pairs.paired & _find_displaced(jumps)]).max(initial=0.0)
             for c, jumps in zip(full.contacts, free.jumps, strict=True)
         ]
         scale = global_max(comm, np.array(gaps))
         if not 0 < scale < np.inf:
             return False
-        linear = full.bulk.linear and not any(contact.finite for contact in full.contacts)
+        linear = full.bulk.linear and not any(
+            contact.contact_kinematics.is_finite for contact in full.contacts
+        )
         max_angle = np.inf if linear else _FIRST_ANGLE
         for _ in range(_MAX_STEPS):
             free = self._find_free_modes(modes)
@@ -299,7 +301,7 @@ class InitialPositioning:
             closing = np.einsum("mqd,qd->qm", jumps, values.normal)
             tangential = tangential_gram(contact, jumps, closed_only=False)
             grams += [tangential, (closing.T * weights) @ closing]
-            touchable = contact.paired & _find_displaced(jumps)
+            touchable = contact.pairs.paired & _find_displaced(jumps)
             rows.append(np.column_stack([closing, values.gap])[touchable])
         tangential, normal = global_sum(comm, grams)
         total = tangential + normal

@@ -141,7 +141,8 @@ def _find_worst(
     unlimited |= any(c.effective_law.own.bound_depends_on_motion for c in frictional)
     # Normals change with finite motions, and with the position of a curved obstacle.
     normals_change = any(
-        c.finite or (c.motions and not c.contact_kinematics.is_flat) for c in contacts
+        c.contact_kinematics.is_finite or (c.motions and not c.contact_kinematics.is_flat)
+        for c in contacts
     )
     if unlimited or normals_change or not frictional or any(c.law.has_tension for c in contacts):
         return None
@@ -157,7 +158,7 @@ def _find_worst(
         normal = contact.values.normal
         normal_part = np.einsum("mqd,qd->mq", modes, normal)
         if contact.law.has_normal_stiffness:
-            approaching.append(normal_part[:, contact.paired])
+            approaching.append(normal_part[:, contact.pairs.paired])
         if contact.law.has_friction:
             tangential = modes - normal_part[:, :, None] * normal
             # Open points may close: they have the bound of the law at zero pressure.

@@ -8,12 +8,15 @@ from contextlib import contextmanager
 import numpy as np
 from petsc4py import PETSc
 
+from fenics_contact.contact.contact import Contact
+from fenics_contact.contact.values import Status
 from fenics_contact.methods.callbacks import defer_interrupts
 from fenics_contact.methods.equations import Equations
+from fenics_contact.parallel import global_max
 from fenics_contact.systems import dense, linear
-from fenics_contact.types import Array
+from fenics_contact.types import Array, Mask
 
-__all__ = ["linearised_solver", "solve_response"]
+__all__ = ["linearise_end", "linearised_solver", "solve_response"]
 
 # Residuals relative to the change of the tractions at fixed displacements; the second is that of a
 # failure. Displacements cancel most of this change if contact is stiff: 1e-3 is too large with
@@ -37,7 +40,9 @@ def linearised_solver(
             full system (length); None: they have their new values.
 
     Yields:
-        The solver, as in `ContactProblem.linearised`; its solutions exclude ``prescribed``.
+        A collective function that returns the change of this rank's unknowns due to tractions added
+        on the body, one array (n_points, gdim) per contact, or for None due to the present
+        residual; without ``prescribed``.
     """
     system = equations.system
     rhs, solution = system.vector(), system.vector()
@@ -86,6 +91,52 @@ def linearised_solver(
         linear.reset_failed_factorisation(equations.solvers[True].getPC())
         for item in (ksp, rhs, solution):
             item.destroy()
+
+
+def linearise_end(
+    equations: Equations, acting: Sequence[tuple[Contact, Mask]], start: Array
+) -> Array | None:
+    """Linearise the end of the increment with contacts restricted to some points. Collective.
+
+    All other points that are closed in ``start`` stick.
+
+    Args:
+        equations: The equations of the increment.
+        acting: Contacts and masks of their active points, (n_points,).
+        start: The state at the start of the increment, with the previous prescribed values.
+
+    Returns:
+        The state; None if the other contacts do not constrain the bodies, or contact forces are not
+        finite.
+    """
+    full, system, present = equations.full, equations.system, equations.full.state()
+    change = None
+    with system.restricted_contacts():
+        try:
+            for operator in system.operators:
+                within = operator.within
+                for contact, points in acting:
+                    if contact is operator.contact:
+                        contact.restrict_to(points if within is None else points & within)
+            if not full.bulk.linear:  # new prescribed values may invert cells
+                change = present - start
+                full.set_state(start)
+                full.update_stiffness()
+            full.evaluate()
+            largest = global_max(full.unknowns.comm, np.abs(system.contact_force()))
+            if not (np.isfinite(largest) and equations.is_constrained()):
+                return None
+            closed = [contact.status != Status.OPEN for contact in full.contacts]
+            springs = [c.values.springs(s, s) for c, s in zip(full.contacts, closed, strict=True)]
+            with linearised_solver(equations, springs, prescribed=change) as solve:
+                return present + solve(None)
+        finally:
+            equations.valid_matrices.discard(True)
+            for contact, _ in acting:
+                contact.restrict_to()
+            full.set_state(present)
+            if not full.bulk.linear:
+                full.update_stiffness()
 
 
 def solve_response(

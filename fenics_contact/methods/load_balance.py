@@ -46,7 +46,7 @@ def find_free_modes(modes: RigidBodyModes, full: FullSystem) -> None:
     unconstrained = modes.find_unconstrained(full.operators, closed_only=False) @ modes.free
     if unconstrained.size:
         motions = "; ".join(modes.describe(row) for row in unconstrained)
-        finite = any(contact.finite for contact in full.contacts)
+        finite = any(contact.contact_kinematics.is_finite for contact in full.contacts)
         order = " to first order" if finite else ""
         raise ValueError(
             f"neither Dirichlet conditions nor contact constrain this rigid-body mode{order}: "

@@ -41,8 +41,6 @@ class Predictor:
     """Initial guesses based on the last increment.
 
     Attributes:
-        factored: Whether the last factored consistent tangent is that of a solution.
-        predict: Whether a step with this tangent may be chosen.
         change: Change of the state of the full system in the last committed increment; None if
             unknown.
         expected: The state at the end of the increment without new contact, or with the previous
@@ -50,12 +48,12 @@ class Predictor:
     """
 
     def __init__(self, equations: Equations) -> None:
-        self.factored = self.predict = False
         self.expected: Array | None = None
         self.change: Array | None = None
         self._equations = equations
         self._prescribed_change: Array | None = None  # change of the prescribed values
         self._converged: list[_ConvergedContact] = []  # of the last solution
+        self._predict = False  # whether a step with its tangent may be chosen
 
     def store_prescribed_change(self, before: Array) -> None:
         """Store the change of prescribed values since ``before``, of a nonlinear bulk. Collective.
@@ -69,20 +67,19 @@ class Predictor:
             vector.array[:] = full.state() - before
             self._prescribed_change = vector.array.copy() if vector.norm() > 0 else None
 
-    def invalidate_tangent(self) -> None:
-        """Note that the factored tangent is not that of the last solution."""
-        self.factored = self.predict = False
-
     def store_solution(self, *, predict: bool) -> None:
-        """Store the contacts of a solution whose tangent is factored. Collective."""
-        self.factored, self.predict = True, predict
+        """Store the contacts of a solution whose tangent is factored. Collective.
+
+        ``predict`` is whether a step with this tangent may be chosen.
+        """
+        self._equations.has_solution_tangent, self._predict = True, predict
         self.store_converged_contacts()
 
     def store_converged_contacts(self) -> None:
         """Store values, tangents and displacements of contacts with rigid obstacles. Collective."""
         self._converged = []
         contacts = self._equations.contacts
-        if not any(contact.rigid for contact in contacts):
+        if not any(contact.contact_kinematics.is_rigid for contact in contacts):
             return
         for contact in contacts:
             contact.evaluate()
@@ -132,8 +129,9 @@ class Predictor:
         add(present)
         forces = equations.function.array_r.copy()
         # After an increment without contact force its tangent does not predict this one.
-        predicts, factored = self.predict and not was_unloaded, self.factored and not was_unloaded
-        self.invalidate_tangent()
+        factored = equations.has_solution_tangent and not was_unloaded
+        predicts = factored and self._predict
+        equations.has_solution_tangent = False
         step = None  # index of the candidate by the tangent of the last solution
         is_reversed = False
         if self._prescribed_change is not None:
@@ -285,7 +283,7 @@ class Predictor:
             change = np.linalg.norm(kinematics.present_jump() - converged.displacement, axis=1)
             if global_max(comm, change / scales.size_at_points(number)) > NEGLIGIBLE:
                 return None
-            if contact.rigid:
+            if contact.contact_kinematics.is_rigid:
                 # A moved obstacle displaces sticking points, and rotates tractions.
                 values = contact.states.evaluate_present()
                 offset = kinematics.rotate(converged.values.jump - values.jump)

@@ -153,7 +153,9 @@ def _is_suitable(contact: Contact) -> bool:
     springs = law.has_normal_stiffness and "k_n" in law.positive
     springs = springs and not (law.has_own_normal or law.has_tension)
     has_friction = law.has_friction or not law.has_tangential
-    return springs and has_friction and not (contact.finite or contact.motions)
+    return (
+        springs and has_friction and not (contact.contact_kinematics.is_finite or contact.motions)
+    )
 
 
 class _Points:

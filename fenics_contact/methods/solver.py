@@ -15,8 +15,6 @@ from petsc4py import PETSc
 from fenics_contact import compat
 from fenics_contact.arguments import check_bool, check_instance, is_number
 from fenics_contact.contact.accuracy import Accuracy
-from fenics_contact.contact.contact import Contact
-from fenics_contact.contact.values import Status
 from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.augmented_lagrangian import RESIDUAL_RATIO, solve_augmented_lagrangian
 from fenics_contact.methods.continuation import Continuation
@@ -36,7 +34,6 @@ from fenics_contact.methods.primal_dual import PrimalDual
 from fenics_contact.methods.quasi_newton import QuasiNewton
 from fenics_contact.methods.retained_dofs import RetainedDofs
 from fenics_contact.methods.tresca_fixed_point import TrescaFixedPoint
-from fenics_contact.parallel import global_max
 from fenics_contact.systems import linear
 from fenics_contact.systems.condensed import CondensedSystem
 from fenics_contact.systems.full import FullSystem
@@ -44,7 +41,7 @@ from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.solver_selection import linear_kind, reason_not_to_condense
 from fenics_contact.systems.system import System
 from fenics_contact.systems.unknowns import DofSubset
-from fenics_contact.types import Array, Indices, Mask
+from fenics_contact.types import Array, Indices
 
 __all__ = ["METHODS", "Settings", "Solver"]
 
@@ -203,7 +200,7 @@ class Solver:
         self.condensed = self._choose_condensation()
         self._full.linear_kind = self._choose_linear_solver()
         self._set_system()
-        self.method = settings.method or self._choose_method()
+        self.method = settings.method or _choose_method(self._full, condensed=self.condensed)
         snes_type = options.get(prefix + "snes_type")
         main_options = self._main_options()
         if snes_type not in (None, main_options.get("snes_type")):
@@ -240,7 +237,7 @@ class Solver:
         this: Solver = weakref.proxy(self)  # without a reference cycle through SNES
         main = QuasiNewton if quasi_newton else Newton
         self.main = main(equations, snes, lambda: this.can_fall_back())
-        self._forget_matrices()
+        self.equations.forget_matrices()
         self.main.attach(consistent=not quasi_newton)
         options.set_from_options(snes)
         options.set_up(snes)
@@ -289,20 +286,6 @@ class Solver:
             logger.info("no static condensation: %s", reason)
         self._reason_not_to_condense = reason
         return reason is None
-
-    def _choose_method(self) -> str:
-        """Choose Newton's method, or L-BFGS.
-
-        L-BFGS is for linear bodies in space without condensation, where a factorisation costs
-        dozens of iterations: it needs one per restart, not per iteration. A ball pressed on a block
-        of 32,000 to a million unknowns takes 1.2 to 1.7 multigrid solutions, and two bolted plates
-        a fifth of the time of Newton's method.
-        """
-        full = self._full
-        if self.condensed or not full.bulk.linear:
-            return "newton"
-        costly = full.gdim == 3 and not full.follows
-        return "lbfgs" if costly or full.linear_kind == "multigrid" else "newton"
 
     def _choose_linear_solver(self) -> str:
         """Choose the linear solver for all unknowns, one of `linear.KINDS`. Collective."""
@@ -415,12 +398,8 @@ class Solver:
     def _reset_matrices(self) -> None:
         """Create the matrices again, without factorisations. Collective."""
         self.snes.reset()
-        self._forget_matrices()
-        self.main.attach(consistent=not isinstance(self.main, QuasiNewton))
-
-    def _forget_matrices(self) -> None:
         self.equations.forget_matrices()
-        self.predictor.invalidate_tangent()
+        self.main.attach(consistent=not isinstance(self.main, QuasiNewton))
 
     # ---- solving ---------------------------------------------------------------------------------
 
@@ -467,14 +446,14 @@ class Solver:
     ) -> tuple[int, list[Attempt]]:
         """Solve by one method after another; return reason and attempts. Collective."""
         equations = self.equations
-        factored = self.predictor.factored
+        factored = equations.has_solution_tangent
         equations.monitor.reset()
         guess = self.predictor.choose_initial_guess(
             first_augmentation=first, was_unloaded=was_unloaded
         )
         start: Array = np.divide(guess, equations.length)
         attempts: list[Attempt] = []
-        methods: Iterable[str] = self._methods_to_try(start, fallback=fallback, balance=balance)
+        methods: Iterable[str] = self._methods_to_try(guess, fallback=fallback, balance=balance)
         if equations.overload is not None:
             # All have failed, and this method detects whether the overload persists.
             methods = ("alternating",)
@@ -485,7 +464,7 @@ class Solver:
             if stiffness_changed:
                 equations.is_h0_current = False
             iterations, reason = self.methods.get(method, self.main).solve()
-            attempts.append(Attempt(method, iterations, self._describe_outcome(reason)))
+            attempts.append(Attempt(method, iterations, _describe_outcome(reason, equations)))
             if reason > 0:
                 equations.overload = None
                 break
@@ -502,7 +481,7 @@ class Solver:
             self.predictor.store_solution(predict=own is None or not self._full.bulk.linear)
         return int(reason), attempts
 
-    def _methods_to_try(self, start: Array, *, fallback: bool, balance: bool) -> Iterator[str]:
+    def _methods_to_try(self, guess: Array, *, fallback: bool, balance: bool) -> Iterator[str]:
         """Yield the method and its fallbacks. Collective.
 
         Raises:
@@ -510,10 +489,7 @@ class Solver:
         """
         yield self.method
         if fallback and balance and not self._full.bulk.linear:
-            x = self.equations.solution.copy()  # the solution is verified if no method follows
-            x.array[:] = start
-            self.equations.set_state(x)
-            x.destroy()
+            self.system.set_state(guess)  # the solution is verified if no method follows
             self._full.evaluate()
             check_balance(self.equations.motions, self._full.load, self._full.operators)
         if fallback and self.can_fall_back():
@@ -525,15 +501,6 @@ class Solver:
                     return  # the others would fail, too, in many more iterations
                 others.remove("alternating")
             yield from others
-
-    def _describe_outcome(self, reason: int) -> str:
-        """Describe the outcome of an attempt. Collective."""
-        if reason > 0:
-            return "converged"
-        if (overload := self.equations.overload) is not None:
-            return overload.describe()
-        description = _OUTCOMES.get(reason, f"SNES reason {reason}")
-        return "; ".join(filter(None, (description, self.equations.monitor.describe_chattering())))
 
     def can_fall_back(self) -> bool:
         """Return whether fallbacks may be tried: not if the caller limits the iterations."""
@@ -550,62 +517,40 @@ class Solver:
     def linearised(
         self, springs: Sequence[Array], load: Array
     ) -> AbstractContextManager[Callable[[Sequence[Array] | None], Array]]:
-        """Linearise the equations at a complete state (`ContactProblem.linearised`). Collective."""
+        """Return `linearised_solver` at a complete state under an external load. Collective."""
         if self.select_dofs():
             self.change_dofs(can_drop=True)
         # Nothing is assembled after a restart at the end of a history.
         self.update_system(self._full.update_stiffness())
-        self.predictor.invalidate_tangent()
         self.system.begin(load)
         return linearised_solver(self.equations, springs)
-
-    def linearise_end(self, acting: Sequence[tuple[Contact, Mask]], start: Array) -> Array | None:
-        """Linearise the end of the increment with contacts restricted to some points. Collective.
-
-        All other points that are closed in ``start`` stick.
-
-        Args:
-            acting: Contacts and masks of their active points, (n_points,).
-            start: The state at the start of the increment, with the previous prescribed values.
-
-        Returns:
-            The state; None if the other contacts do not constrain the bodies, or contact forces are
-            not finite.
-        """
-        full, present = self._full, self._full.state()
-        change = None
-        with self.system.restricted_contacts():
-            try:
-                for operator in self.system.operators:
-                    within = operator.within
-                    for contact, points in acting:
-                        if contact is operator.contact:
-                            contact.restrict_to(points if within is None else points & within)
-                if not full.bulk.linear:  # new prescribed values may invert cells
-                    change = present - start
-                    full.set_state(start)
-                    full.update_stiffness()
-                full.evaluate()
-                largest = global_max(self._comm, np.abs(self.system.contact_force()))
-                if not (np.isfinite(largest) and self.equations.is_constrained()):
-                    return None
-                closed = [contact.status != Status.OPEN for contact in full.contacts]
-                springs = [
-                    c.values.springs(s, s) for c, s in zip(full.contacts, closed, strict=True)
-                ]
-                self.predictor.invalidate_tangent()
-                with linearised_solver(self.equations, springs, prescribed=change) as solve:
-                    return present + solve(None)
-            finally:
-                self.equations.valid_matrices.discard(True)
-                for contact, _ in acting:
-                    contact.restrict_to()
-                full.set_state(present)
-                if not full.bulk.linear:
-                    full.update_stiffness()
 
     def respond(self, springs: Sequence[Array], tractions: Sequence[Array]) -> list[Array]:
         """Compute changes of the jumps by tractions, with the last factored matrix. Collective."""
         valid = self.equations.valid_matrices
         consistent = self.main.consistent or True in valid or False not in valid
         return solve_response(self.equations, springs, tractions, consistent=consistent)
+
+
+def _choose_method(full: FullSystem, *, condensed: bool) -> str:
+    """Choose Newton's method, or L-BFGS.
+
+    L-BFGS is for linear bodies in space without condensation, where a factorisation costs dozens of
+    iterations: it needs one per restart, not per iteration. A ball pressed on a block of 32,000 to
+    a million unknowns takes 1.2 to 1.7 multigrid solutions, and two bolted plates a fifth of the
+    time of Newton's method.
+    """
+    if condensed or not full.bulk.linear:
+        return "newton"
+    costly = full.gdim == 3 and not full.follows
+    return "lbfgs" if costly or full.linear_kind == "multigrid" else "newton"
+
+
+def _describe_outcome(reason: int, equations: Equations) -> str:
+    """Describe the outcome of an attempt by its SNES reason. Collective."""
+    if reason > 0:
+        return "converged"
+    if equations.overload is not None:
+        return equations.overload.describe()
+    description = _OUTCOMES.get(reason, f"SNES reason {reason}")
+    return "; ".join(filter(None, (description, equations.monitor.describe_chattering())))

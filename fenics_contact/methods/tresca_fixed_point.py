@@ -150,7 +150,7 @@ class TrescaFixedPoint(StandaloneMethod):
         if refused:
             laws = ", ".join(type(c.law).__name__ for c in refused)
             why = "not even with a given friction bound"
-            if all(c.finite for c in refused):
+            if all(c.contact_kinematics.is_finite for c in refused):
                 why = "with finite kinematics, because the tangent planes rotate"
             raise ValueError(
                 f"method is 'alternating', but {laws} has no potential, {why}, so that there is "

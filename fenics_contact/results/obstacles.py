@@ -66,7 +66,7 @@ class ObstacleShape:
     @staticmethod
     def is_known(contact: Contact) -> bool:
         """Return whether the surface is defined in space, not by a gap on Γc, and rigid."""
-        if not contact.rigid or contact.gap_prescribed:
+        if not contact.contact_kinematics.is_rigid or contact.gap_prescribed:
             return False
         if isinstance(contact.obstacle, SampledObstacle):
             return True

@@ -268,11 +268,11 @@ class _Surface:
         }
         at_nodes = {"displacement": (x_deformed - x).reshape(self._shape)} | at_nodes
         in_facets: dict[str, npt.NDArray[Any]] = {"status": facet_status(contact)}
-        fields: dict[str, npt.NDArray[Any]] = {"displacement": contact.own_displacement()}
+        fields: dict[str, npt.NDArray[Any]] = {"displacement": contact.pairs.own_displacement()}
         fields |= {**at_points, "status": contact.status}
-        if not contact.rigid:
-            in_facets["paired"] = np.mean(contact.paired[rows], axis=1)
-            fields["paired"] = contact.paired.astype(np.float64)
+        if not contact.contact_kinematics.is_rigid:
+            in_facets["paired"] = np.mean(contact.pairs.paired[rows], axis=1)
+            fields["paired"] = contact.pairs.paired.astype(np.float64)
         order = np.ravel(rows)  # facet by facet
         points = {name: values[order][:, None] for name, values in fields.items()}
         return (
@@ -284,7 +284,7 @@ class _Surface:
         """Return the values at the points, by name. Collective."""
         contact = self._contact
         values = {"pressure": contact.pressure + 0.0}  # no -0
-        if contact.finite:
+        if contact.contact_kinematics.is_finite:
             values["true_pressure"] = contact.pressure / contact.area_stretch()
         return values | {
             "tangential_traction": contact.tangential_traction,

@@ -34,7 +34,7 @@ def find_active_points(contact: Contact) -> Mask:
     values = contact.values
     # Comparisons with NaN are false.
     acts = np.any(np.abs(values.total_traction) > 0.0, axis=1) | (values.friction_bound > 0.0)
-    return np.asarray((contact.status != Status.OPEN) | (acts & contact.paired))
+    return np.asarray((contact.status != Status.OPEN) | (acts & contact.pairs.paired))
 
 
 def compute_contact_distances(contact: Contact) -> Array:
@@ -43,7 +43,7 @@ def compute_contact_distances(contact: Contact) -> Array:
     It is -∞ at active points, and at all points if the gap is prescribed, since the gap is then not
     closed by displacements. It is ∞ at points without an opposite point.
     """
-    gap = np.where(contact.paired, contact.values.gap, np.inf)
+    gap = np.where(contact.pairs.paired, contact.values.gap, np.inf)
     return np.where(find_active_points(contact) | contact.gap_prescribed, -np.inf, gap)
 
 

@@ -312,7 +312,7 @@ class FullSystem(System):
 
 def _has_coupling(contact: Contact) -> bool:
     """Return whether a contact couples unknowns that the bulk does not couple."""
-    return not contact.rigid or bool(contact.motions)
+    return not contact.contact_kinematics.is_rigid or bool(contact.motions)
 
 
 def _diagonal(matrix: PETSc.Mat) -> Array:

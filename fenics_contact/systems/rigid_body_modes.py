@@ -259,7 +259,8 @@ class RigidBodyModes(RigidMotions):
                 tangential = modes - normal_jumps[:, :, None] * normal
                 gram += (normal_jumps * (weights * active[0])) @ normal_jumps.T
                 gram += np.einsum("mqd,q,nqd->mn", tangential, weights * active[1], tangential)
-                unknown[group[active.any(axis=0) & (values.paired > 0) & ~contact.paired]] = 1.0
+                lost = (values.paired > 0) & ~contact.pairs.paired
+                unknown[group[active.any(axis=0) & lost]] = 1.0
         gram, area, unknown = (global_sum(self.comm, part) for part in (gram, area, unknown))
         modes = self._null_space(gram, area)
         return modes[~((modes != 0.0) @ (unknown[self.groups()] > 0.0))]

@@ -199,13 +199,15 @@ class RigidMotions:
         arm = (contact.points - self._centres[slave]) / self._sizes[slave, None]
         displacements = np.array(list(rigid_motions(arm, 1.0).values()))
         sides = [(slave, displacements)]
-        if not contact.rigid:
+        if not contact.contact_kinematics.is_rigid:
             # The jump map gives the displacement of the master side, which may be the same body.
             # Tractions at unpaired points stay unbalanced.
             jumps = np.array([operator.jump(motion) for motion in self.of_bodies])
             difference = operator.jump(self._scales.partition.label.astype(np.float64))[:, 0]
-            paired = contact.paired[:, None]
-            master = np.where(contact.paired, slave - np.rint(difference).astype(np.intp), slave)
+            paired = contact.pairs.paired[:, None]
+            master = np.where(
+                contact.pairs.paired, slave - np.rint(difference).astype(np.intp), slave
+            )
             sides.append((master, np.where(paired, jumps - displacements, 0.0)))
         if compat.geometry_element(space.mesh).degree > space.ufl_element().degree:
             # Displacements of lower degree than the geometry contain no rotations.

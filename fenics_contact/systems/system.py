@@ -225,7 +225,7 @@ class System(ABC):
         """
         size = np.abs(state)
         for operator in self.operators:
-            if not operator.contact.rigid:
+            if not operator.contact.contact_kinematics.is_rigid:
                 coupled = operator.coupled_dofs
                 size[coupled] = global_max(self.unknowns.comm, size[coupled])
         return np.asarray(self.diagonal * (size + self._largest_coordinates()))
@@ -236,7 +236,7 @@ class System(ABC):
         if self._coordinate_bounds is None or self._coordinate_bounds[0] != pairings:
             bounds = np.zeros(self.unknowns.n_local)
             for operator in self.operators:
-                if operator.contact.finite:
+                if operator.contact.contact_kinematics.is_finite:
                     points = np.abs(operator.contact.points)
                     bounds[operator.coupled_dofs] = global_max(self.unknowns.comm, points)
             self._coordinate_bounds = [c.pairs.n_updates for c in self.contacts], bounds
