@@ -156,7 +156,7 @@ def fail_increments_above(scene: BlockOnBall, largest: float) -> list[float]:
         if current_t[0] - committed_t[0] > largest:
             scene.problem.solver.main.max_it, max_iterations = 0, scene.problem.solver.main.max_it
             scene.problem.snes.setTolerances(max_it=0)
-            scene.problem.solver.predictor.predict = False  # its result can be the solution
+            scene.problem.solver.equations.has_solution_tangent = False  # a step can solve it
             try:
                 return solve(**kwargs)
             finally:

@@ -555,7 +555,7 @@ def test_unloaded_block_keeps_its_position_until_it_is_pushed():
     ]
     side = scene.contact("pressed", RIGHT, ("neighbour", LEFT), fc.Frictionless(), name="side")
     scene.problem(*contacts, side).solve()
-    assert np.abs(contacts[1].own_displacement()).max(initial=0.0) < 1e-12
+    assert np.abs(contacts[1].pairs.own_displacement()).max(initial=0.0) < 1e-12
 
 
 @pytest.mark.each
