@@ -22,7 +22,7 @@ from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.hierarchy import Hierarchy
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
 from fenics_contact.systems.system import System
-from fenics_contact.tolerances import ROUND_OFF, UNLOADED_FORCE_RATIO
+from fenics_contact.tolerances import NEGLIGIBLE, ROUND_OFF, UNLOADED_FORCE_RATIO
 from fenics_contact.types import Array
 
 __all__ = ["Equations"]
@@ -298,13 +298,20 @@ class Equations:
         return (operator.tangent() for operator in self.system.operators)
 
     def stiffnesses(self, *, everywhere: bool) -> Iterator[PETSc.Mat]:
-        """Yield αK_n + φK_t of the evaluated contacts; ``everywhere``: all of Γc sticks."""
-        for operator in self.system.operators:
+        """Yield αK_n + φK_t of the evaluated contacts; ``everywhere``: all of Γc sticks.
+
+        Open points whose gap is zero, as between bodies without load, resist the next step: they
+        stick.
+        """
+        for number, operator in enumerate(self.system.operators):
             contact = operator.contact
             normal = tangential = np.ones(contact.quadrature.n_points)
             if not everywhere:
-                normal = np.where(contact.status != Status.OPEN, 1.0, _OPEN_STIFFNESS_RATIO)
-                tangential = np.where(contact.status == Status.STICK, 1.0, _OPEN_STIFFNESS_RATIO)
+                status, size = contact.status, self.full.scales.size_at_points(number)
+                touches = (status == Status.OPEN) & (contact.gap <= NEGLIGIBLE * size)
+                closed, sticks = (status != Status.OPEN), (status == Status.STICK)
+                normal = np.where(closed | touches, 1.0, _OPEN_STIFFNESS_RATIO)
+                tangential = np.where(sticks | touches, 1.0, _OPEN_STIFFNESS_RATIO)
             springs = contact.values.springs(self._alpha * normal, self._phi * tangential)
             yield operator.springs(springs)
 
