@@ -154,7 +154,11 @@ def linear_solve(body: problems.ContactScene, degree: int, kind: str = "direct")
 
 
 def solve_once(
-    u: fem.Function, residual: ufl.Form, bcs: Sequence[fem.DirichletBC], kind: str = "direct"
+    u: fem.Function,
+    residual: ufl.Form,
+    bcs: Sequence[fem.DirichletBC],
+    kind: str = "direct",
+    ties: Sequence[PETSc.Mat] = (),
 ) -> Row:
     """Assemble and solve a problem that is linear in u, which becomes the solution. Collective.
 
@@ -163,10 +167,13 @@ def solve_once(
         residual: Residual form F.
         bcs: Dirichlet conditions.
         kind: "direct" or "multigrid", as in `linear_solve`.
+        ties: Matrices to be added, which tie bodies.
     """
     bilinear = fem.form(ufl.derivative(residual, u))
     matrix = fem.petsc.assemble_matrix(bilinear, bcs)
     matrix.assemble()
+    for tie in ties:
+        matrix.axpy(1.0, tie, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
     matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
     b = fem.petsc.assemble_vector(fem.form(-residual))
     b.ghostUpdate(*_REVERSE)

@@ -130,7 +130,8 @@ def _cost(folder: Path) -> list[str]:
         *items,
         "- **bolted joint**, three bodies, quadratic tetrahedra, "
         f"{joint[0]['dofs']} dofs: {min(solved):.1f} to {max(solved):.1f} for an increment; "
-        f"{refusals} for the refusal of a load above the friction limit, on one and two ranks "
+        f"{refusals} for the refusal of a load above the friction limit, on one and two ranks, in "
+        "linear solves of the bodies tied at the contacts "
         "([all runs](benchmarks/bolted_joint/bolted_joint.csv))",
         '"Interior at the end": `increments(..., recover_interior="last")`. Newton iterations at '
         "large strains are in [finite.csv](benchmarks/finite/finite.csv).",

@@ -270,7 +270,7 @@ def run(scene: Scene, seed: int, configuration: str, limit: float) -> timing.Row
         row = {"outcome": "slow", "seconds": limit}
     except subprocess.CalledProcessError:
         row = {"outcome": "failed"}
-    return {"seed": seed, "way": configuration} | row
+    return {"seed": seed, "configuration": configuration} | row
 
 
 # ---- evaluation ----------------------------------------------------------------------------------
@@ -280,7 +280,7 @@ def compare_with_fastest(rows: list[timing.Row]) -> list[timing.Row]:
     """Compare the default with the fastest other configuration of every scene."""
     table = []
     for seed in dict.fromkeys(row["seed"] for row in rows):
-        mine = {row["way"]: row for row in rows if row["seed"] == seed}
+        mine = {row["configuration"]: row for row in rows if row["seed"] == seed}
         solved = {
             configuration: row for configuration, row in mine.items() if row["outcome"] == "solved"
         }
@@ -332,7 +332,7 @@ def main() -> None:
             print(
                 "   ",
                 configuration,
-                {k: v for k, v in row.items() if k not in ("seed", "way")},
+                {k: v for k, v in row.items() if k not in ("seed", "configuration")},
                 flush=True,
             )
             rows.append(row | asdict(scene) | {"dofs": row.get("dofs", scene.dofs)})
@@ -343,9 +343,8 @@ def main() -> None:
                 )
         arguments.output.mkdir(parents=True, exist_ok=True)
         report.save(arguments.output / "selection.csv", rows)  # after every scene
-    timing.write(
-        arguments.output, "regret", "The default against the best way", compare_with_fastest(rows)
-    )
+    title = "The default against the fastest configuration"
+    timing.write(arguments.output, "regret", title, compare_with_fastest(rows))
 
 
 if __name__ == "__main__":

@@ -159,8 +159,8 @@ def _all() -> list[Target]:
     found.append(Target(problem, f"time / {solve}", "tagged/tagged.csv", tagged, 2.5))
     for ranks in (1, 2):
         problem = f"bolted joint, worst increment, {ranks} rank{'s' * (ranks > 1)}"
-        joint = "bolted_joint/bolted_joint.csv"
-        found.append(Target(problem, f"time / {solve}", joint, measure_largest_cost(ranks), 3.0))
+        joint, tied = "bolted_joint/bolted_joint.csv", "time / one linear solve, bodies tied"
+        found.append(Target(problem, tied, joint, measure_largest_cost(ranks), 1.5))
     for what, bodies in (
         ("disc", "rubber block under a disc"),
         ("two bodies", "two rubber blocks"),

@@ -18,10 +18,9 @@ from fenics_contact.types import Array, Mask
 
 __all__ = ["linearise_end", "linearised_solver", "solve_response"]
 
-# Residuals relative to the change of the tractions at fixed displacements; the second is that of a
-# failure. Displacements cancel most of this change if contact is stiff: 1e-3 is too large with
-# k h/E = 2000 and multigrid.
-_RESPONSE_RTOL, _FAILED_RTOL = 1e-4, 1e-2
+# Residual of a response relative to the contact force, and of a failure, relative to this force or
+# to the added forces, which are much larger if contact is stiff.
+_RESPONSE_TOLERANCE, _MAX_RESPONSE_RESIDUAL = 1e-3, 1e-2
 
 
 @contextmanager
@@ -148,7 +147,8 @@ def solve_response(
 ) -> list[Array]:
     """Compute approximate changes of the jump at the points of every contact. Collective.
 
-    The preconditioner is a matrix factored before, near the tangent of the solution.
+    Equilibrium holds up to a thousandth of the contact force on every group of coupled bodies. The
+    preconditioner is a matrix factored before, near the tangent of the solution.
 
     Args:
         equations: The equations at a solution.
@@ -169,21 +169,37 @@ def solve_response(
         for operator, traction in zip(system.operators, tractions, strict=True):
             operator.add_force(rhs, traction)
         rhs.array[system.constrained] = 0.0
-        rhs.scale(-1.0 / system.bulk.scale)
+        size = _size_by_group(equations, rhs.array_r) / system.bulk.scale
+        rhs.array[:] /= -size * system.bulk.scale  # the matrix does not couple groups
         ksp.setOperators(matrix)
         ksp.setType(PETSc.KSP.Type.FGMRES)
         ksp.getPC().setType("python")
         ksp.getPC().setPythonContext(_FactoredPreconditioner(equations.solvers[consistent]))
-        ksp.setTolerances(rtol=_RESPONSE_RTOL, max_it=100)
+        ksp.setTolerances(rtol=1e-12, atol=_RESPONSE_TOLERANCE, max_it=100)
         ksp.solve(rhs, solution)
         dense.raise_stored_error(equations.solvers[consistent])
-        if ksp.getResidualNorm() > _FAILED_RTOL * rhs.norm():
+        if not ksp.getResidualNorm() <= _MAX_RESPONSE_RESIDUAL * max(1.0, rhs.norm()):
             solution.set(np.nan)
+        solution.array[:] *= size
         return [operator.jump(solution.array_r) for operator in system.operators]
     finally:
         system.diagonal = diagonal
         for item in (ksp, matrix, rhs, solution):
             item.destroy()
+
+
+def _size_by_group(equations: Equations, added: Array) -> Array:
+    """Return the norm of the contact forces on the group of every unknown, (n_local,). Collective.
+
+    Without contact force on a group it is the norm of the added forces.
+    """
+    system, scales = equations.system, equations.full.scales
+    squares = np.zeros((2, scales.n_groups))
+    for total, sizes in zip(squares, system.by_body(system.contact_force(), added), strict=True):
+        np.add.at(total, scales.group, sizes**2)
+    loaded, unloaded = np.sqrt(squares)
+    size = np.where(loaded > scales.round_off_of_groups, loaded, unloaded)
+    return np.asarray(np.where(size > 0.0, size, 1.0)[scales.group[system.partition.label]])
 
 
 class _FactoredPreconditioner:
