@@ -13,13 +13,10 @@ from fenics_contact.compiling import compile_form
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_sum, max_norm
 from fenics_contact.surface.mass import assemble_values
+from fenics_contact.tolerances import EVALUATION_ROUND_OFF
 from fenics_contact.types import Array
 
 __all__ = ["CrossCheck"]
-
-
-# Round-off of displacements summed in different orders, relative to their magnitude.
-_SUMMATION_ROUND_OFF_RATIO = 100 * np.finfo(float).eps
 
 
 class CrossCheck:
@@ -45,7 +42,7 @@ class CrossCheck:
             d = values.x.shape[1]
             sizes = (max_norm(comm, f.reshape(-1, d)) for f in (by_points - by_form, by_points))
             residual, force = (float(size) for size in sizes)
-            allowed = 1e-10 * force + _SUMMATION_ROUND_OFF_RATIO * sensitivity
+            allowed = 1e-10 * force + EVALUATION_ROUND_OFF * sensitivity
             balances[contact.name] = ForceBalance(residual, force, allowed)
         return balances
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from dolfinx import fem
 
+from fenics_contact.checks.obstacles import MAX_ROTATION
 from fenics_contact.checks.penetration import (
     ALLOWED_BEFORE,
     DEPTH_RESOLUTION,
@@ -29,8 +30,6 @@ __all__ = ["RigidObstacleProbe"]
 
 # Steps along a facet towards its deepest position in an obstacle.
 _MAX_DESCENT_STEPS = 12
-# Rotation (radians) over which the displacement is linear in time: a right angle and round-off.
-_MAX_ROTATION_PER_PART = np.pi / 2 + 1e-9
 # Bisections of a path for the position at which the normal turns to the opposite side.
 _BISECTIONS = 20
 
@@ -242,7 +241,7 @@ class RigidObstacleProbe:
         Γc moves along straight lines, the obstacle rotates and changes its shape at constant rates.
         A rotation by more than a right angle is divided, as it may have led through the body.
         """
-        n = max(1, int(np.ceil(abs(self.rotation.angle) / _MAX_ROTATION_PER_PART)))
+        n = max(1, int(np.ceil(abs(self.rotation.angle) / MAX_ROTATION)))
         parts = [self._find_crossed_between(k / n, (k + 1) / n, allowed) for k in range(n)]
         return np.concatenate(parts)
 

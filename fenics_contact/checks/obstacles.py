@@ -10,17 +10,19 @@ from fenics_contact.checks.condition import Condition
 from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.values import Status
 from fenics_contact.parallel import global_max
+from fenics_contact.tolerances import NEGLIGIBLE
 
-__all__ = ["ObstacleCheck"]
+__all__ = ["MAX_ROTATION", "ObstacleCheck"]
 
 
 # Largest difference between the gradient of a distance and minus its unit normal.
 _MAX_GRADIENT_ERROR = 0.05
 # Penetration relative to the distance from the centre of curvature: 1 is half of the radius.
 _MAX_CURVATURE_DEPTH_RATIO = 1.0
-# Rotation of an obstacle in one increment (radians): a right angle and round-off. Beyond two right
-# angles the straight path of a point leads backwards.
-_MAX_ROTATION = np.pi / 2 + 1e-9
+# Largest rotation of an obstacle in one increment, and over which displacements are linear in time
+# (radians): a right angle and round-off. Beyond two right angles the straight path of a point leads
+# backwards.
+MAX_ROTATION = np.pi / 2 + NEGLIGIBLE
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,6 @@ class ObstacleCheck:
             for name, value, limit, failure in (
                 ("gradient of the gap", self.gradient_error, _MAX_GRADIENT_ERROR, distance),
                 ("depth by radius of curvature", self.depth, _MAX_CURVATURE_DEPTH_RATIO, deep),
-                ("rotation of the obstacle", self.rotation, _MAX_ROTATION, rotation),
+                ("rotation of the obstacle", self.rotation, MAX_ROTATION, rotation),
             )
         ]

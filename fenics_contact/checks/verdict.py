@@ -14,6 +14,7 @@ from fenics_contact.contact.contact import Contact
 from fenics_contact.markup import html_table
 from fenics_contact.parallel import global_max, global_min, max_norm
 from fenics_contact.systems.balance import MAX_ROUND_OFF_RESIDUAL_RATIO
+from fenics_contact.tolerances import EVALUATION_ROUND_OFF
 from fenics_contact.types import Array
 from fenics_contact.wording import percent
 
@@ -21,8 +22,7 @@ __all__ = ["ForceBalance", "Verdict", "check_laws"]
 
 # Relative violation of the contact laws, which hold at every point up to round-off.
 _LAW_TOLERANCE = 1e-10
-# Round-off of coordinates and tractions relative to their magnitude, divided by that tolerance.
-_SCALED_ROUND_OFF_RATIO = 16 * np.finfo(float).eps / _LAW_TOLERANCE
+_SCALED_ROUND_OFF = EVALUATION_ROUND_OFF / _LAW_TOLERANCE
 # Energy supplied by friction relative to the energy exchanged: 6 % if a tangential load is reversed
 # in one increment, half or more in states that smaller increments do not lead to.
 _MAX_FRICTION_ENERGY_GAIN = 0.25
@@ -324,7 +324,7 @@ def check_laws(contact: Contact) -> dict[str, float]:
         return value / scale if scale > 0 or not np.isfinite(scale) else value
 
     x = contact.surface.mesh.geometry.x
-    round_off = np.full(1, _SCALED_ROUND_OFF_RATIO * (global_max(comm, x) - global_min(comm, x)))
+    round_off = np.full(1, _SCALED_ROUND_OFF * (global_max(comm, x) - global_min(comm, x)))
     r_n, gap, length = v.normal_traction, v.gap, (v.initial_gap, v.normal_displacement, round_off)
     violations = [relative(worst(v.initial_gap - v.normal_displacement - gap), gap, *length)]
     k_n = np.where(r_n != 0, v.normal_stiffness, 0.0)  # may be infinite without traction
@@ -367,7 +367,7 @@ def check_laws(contact: Contact) -> dict[str, float]:
     # Slip has the round-off of displacements, and of tractions divided by the stiffness.
     size = np.linalg.norm(tau, axis=1)
     elastic_slip = np.divide(size, stiffest, out=np.zeros_like(size), where=stiffest > 0)
-    travel = (v.jump, v.increment, change, round_off, _SCALED_ROUND_OFF_RATIO * elastic_slip)
+    travel = (v.jump, v.increment, change, round_off, _SCALED_ROUND_OFF * elastic_slip)
     errors["cone"] = relative(worst(np.maximum(functions, 0)), bound)
     # Without pressure the bound may be zero instead of that of the law.
     difference = np.where((r_n < 0) | (bound != 0.0), bound - v.law_friction_bound, 0.0)

@@ -27,19 +27,15 @@ from fenics_contact.surface.bodies import connected_bodies
 from fenics_contact.surface.fields import PointFields
 from fenics_contact.surface.mass import create_mass_solver
 from fenics_contact.surface.surface import SurfaceQuadrature
-from fenics_contact.tolerances import ROUND_OFF
+from fenics_contact.tolerances import EVALUATION_ROUND_OFF, ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Multipliers", "TraceProjection"]
 
-# Round-off of a jump, relative to its size.
-_JUMP_ROUND_OFF = 100 * np.finfo(float).eps
 # If tractions have grown by more than the first factor since the first augmentation, the penalty
 # part must have decreased below the second factor times that of the first: otherwise multipliers
 # diverge, and the penalty part is small only relative to them.
 _TRACTION_GROWTH_RATIO, _PENALTY_REDUCTION_RATIO = 2.0, 0.1
-# Round-off of a traction, relative to its size.
-_TRACTION_ROUND_OFF = 16 * np.finfo(float).eps
 
 
 class TraceProjection:
@@ -144,12 +140,12 @@ class Multipliers:
         committed_scale = largest(history.values(n) for n in names)
         # The round-off of the jump times the stiffness is a traction.
         springs = [values.parameters[n] for n in sorted({"k_n", "k_t"} & set(values.parameters))]
-        noise = _JUMP_ROUND_OFF * largest(k * moved for k in springs)
+        noise = EVALUATION_ROUND_OFF * largest(k * moved for k in springs)
         is_loaded = scale > noise
         is_first = is_loaded & (change > 0) & np.isnan(self._first[0])
         self._first = np.where(is_first, [change, scale], self._first)
         # The penalty part may be below the round-off of multipliers that have grown.
-        penalty_part = np.maximum(change, _TRACTION_ROUND_OFF * scale)
+        penalty_part = np.maximum(change, EVALUATION_ROUND_OFF * scale)
         first = np.where(np.isnan(self._first), [penalty_part, scale], self._first)
         is_diverging = is_loaded & (scale > _TRACTION_GROWTH_RATIO * first[1])
         is_diverging &= penalty_part > _PENALTY_REDUCTION_RATIO * first[0]

@@ -6,6 +6,7 @@ import math
 
 import ufl
 
+from fenics_contact.tolerances import ROUND_OFF
 from fenics_contact.types import Expr
 
 __all__ = [
@@ -17,9 +18,9 @@ __all__ = [
     "return_to_segment",
 ]
 
-# A trial traction above the limit by less than this fraction of it sticks: a point that slipped in
-# the last increment starts at its limit, where round-off must not decide between stick and slip.
-_SLIP_EXCESS_RATIO = 1e-12
+# A point that slipped in the last increment starts at its limit, where round-off must not decide
+# between stick and slip: it sticks up to this trial traction relative to the limit.
+_SLIP_RATIO = 1 + ROUND_OFF
 
 
 def positive_part(value: Expr) -> Expr:
@@ -54,7 +55,7 @@ def return_to_segment(trial: Expr, limit: Expr, tangent: Expr) -> tuple[Expr, tu
     """
     along = ufl.dot(trial, tangent)
     excess = (_excess(along, limit), _excess(-along, limit))
-    slips = ufl.gt(abs(along), (1 + _SLIP_EXCESS_RATIO) * limit)
+    slips = ufl.gt(abs(along), _SLIP_RATIO * limit)
     returned = ufl.conditional(slips, clip(along, limit), along)
     return _zero_without_limit(limit, returned) * tangent, excess
 
@@ -67,14 +68,14 @@ def _zero_without_limit(limit: Expr, value: Expr) -> Expr:
 
 def _excess(value: Expr, limit: Expr) -> Expr:
     """Return value - limit where the point slips, otherwise 0."""
-    return ufl.conditional(ufl.gt(value, (1 + _SLIP_EXCESS_RATIO) * limit), value - limit, 0)
+    return ufl.conditional(ufl.gt(value, _SLIP_RATIO * limit), value - limit, 0)
 
 
 def return_to_cone(trial: Expr, limit: Expr) -> tuple[Expr, tuple[Expr, ...]]:
     """Return τ and k_t Δβ in space, with the one mode g = |τ| - limit of the circular cone."""
     # The norm is used and differentiated only where it exceeds the limit, hence never at zero.
     size = ufl.sqrt(ufl.dot(trial, trial))
-    slips = ufl.gt(size, (1 + _SLIP_EXCESS_RATIO) * limit)
+    slips = ufl.gt(size, _SLIP_RATIO * limit)
     traction = _zero_without_limit(limit, ufl.conditional(slips, limit / size, 1)) * trial
     return traction, (ufl.conditional(slips, size - limit, 0),)
 

@@ -16,13 +16,12 @@ from mpi4py import MPI
 from fenics_contact.contact.contact import Contact
 from fenics_contact.parallel import global_sum
 from fenics_contact.systems.reference_scales import ReferenceScales
-from fenics_contact.tolerances import NEGLIGIBLE
+from fenics_contact.tolerances import NEGLIGIBLE, ROUND_OFF
 from fenics_contact.types import Array
 
 __all__ = ["Acceleration"]
 
-# Earlier augmentations combined with the last one; relative rank tolerance of their Gram matrix.
-_DEPTH, _GRAM_RANK_TOLERANCE = 6, 1e-12
+_DEPTH = 6  # number of earlier augmentations combined with the last one
 
 
 class Acceleration:
@@ -91,5 +90,5 @@ class Acceleration:
         gram, rhs = products[:-2, :-2], products[:-2, -1]
         norms = np.sqrt(np.maximum(np.diag(gram), np.finfo(np.float64).tiny))
         gram = gram / np.outer(norms, norms)
-        coefficients = np.linalg.lstsq(gram, rhs / norms, rcond=_GRAM_RANK_TOLERANCE)[0] / norms
+        coefficients = np.linalg.lstsq(gram, rhs / norms, rcond=ROUND_OFF)[0] / norms
         return np.asarray(new[-1] - np.tensordot(coefficients, np.diff(new, axis=0), axes=1))

@@ -13,6 +13,7 @@ from fenics_contact.methods.attempt import Attempt
 from fenics_contact.methods.equations import Equations
 from fenics_contact.parallel import global_sum
 from fenics_contact.systems.multiplier_projection import project_multiplier_updates
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
 
 __all__ = ["RESIDUAL_RATIO", "solve_augmented_lagrangian"]
@@ -29,7 +30,7 @@ _NEARLY_CONVERGED_RATIO = 10.0
 _FINAL_OVERLOAD_GROWTH_RATIO = 0.1
 # Multipliers are scaled down if the load falls below this fraction, except to zero: multipliers
 # that are too large open the contact, and without any it would depend on round-off.
-_REDUCED_LOAD_RATIO, _ZERO_LOAD_RATIO = 0.2, 1e-10
+_REDUCED_LOAD_RATIO = 0.2
 
 
 def solve_augmented_lagrangian(
@@ -114,7 +115,7 @@ def _scale_down_multipliers(equations: Equations, load_before: Array) -> None:
         if not sizes[1, bodies].any():  # bodies loaded by others only: all of the group
             bodies = np.isin(full.scales.group, full.scales.group[bodies])
         present, before = (float(np.linalg.norm(size[bodies])) for size in sizes)
-        if _ZERO_LOAD_RATIO * before < present < _REDUCED_LOAD_RATIO * before:
+        if NEGLIGIBLE * before < present < _REDUCED_LOAD_RATIO * before:
             operator.contact.multipliers.scale_pressure(present / before)
             operator.contact.states.forget()
 

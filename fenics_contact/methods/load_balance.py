@@ -17,13 +17,11 @@ from fenics_contact.parallel import broadcast_from_root, gather_rows
 from fenics_contact.systems.full import FullSystem
 from fenics_contact.systems.operator import ContactOperator
 from fenics_contact.systems.rigid_body_modes import RigidBodyModes
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array, Index
 
 __all__ = ["check_balance", "find_free_modes", "unbalanced"]
 
-# Negligible generalised force relative to the largest of the load; negligible entry of unit modes
-# at the points.
-_ZERO_FORCE_RATIO, _ZERO_MODE = 1e-8, 1e-10
 # Sides of the circumscribed polygon of the friction cone in space, which excludes no equilibrium.
 _CONE_SIDES = 64
 # A uniform sample of so many rays nearly always suffices.
@@ -79,7 +77,7 @@ def check_balance(modes: RigidBodyModes, load: Array, operators: Sequence[Contac
     comm = modes.comm
     local_rays = [_compute_admissible_forces(o, modes.jumps_at(o)[rows]) for o in operators]
     all_rays = gather_rows(comm, np.concatenate([np.zeros((0, len(rows))), *local_rays]))
-    acts = (np.abs(all_rays) > _ZERO_MODE).astype(np.float64)
+    acts = (np.abs(all_rays) > NEGLIGIBLE).astype(np.float64)
     couples = acts.T @ acts + modes.find_coupled_modes()[np.ix_(rows, rows)]
     n_groups, label = scipy.sparse.csgraph.connected_components(couples, directed=False)
     failures: list[str] = []
@@ -90,9 +88,9 @@ def check_balance(modes: RigidBodyModes, load: Array, operators: Sequence[Contac
         direction, rays = -resultant[group] / largest, all_rays[:, group]
         # Rays have unit length, for the conditioning; those of round-off are left out.
         length = np.linalg.norm(rays, axis=1)
-        rays = rays[length > _ZERO_MODE] / length[length > _ZERO_MODE, None]
+        rays = rays[length > NEGLIGIBLE] / length[length > NEGLIGIBLE, None]
         residual = broadcast_from_root(comm, unbalanced(rays.T, direction)) if len(rays) else 1.0
-        allowed = _ZERO_FORCE_RATIO * max(1.0, size[group].max() / largest)
+        allowed = NEGLIGIBLE * max(1.0, size[group].max() / largest)
         if residual > allowed:
             limits = broadcast_from_root(comm, _maximise_forces(rays.T, direction)) + 0.0  # no -0
             failures += _describe(modes, rows[group], direction, limits, allowed, largest)
@@ -167,7 +165,7 @@ def unbalanced(rays: Array, resultant: Array) -> float:
             forces = scipy.optimize.nnls(sample, resultant)[0]
         except RuntimeError:
             continue  # too many iterations
-        if np.abs(sample @ forces - resultant).sum() < _ZERO_FORCE_RATIO:
+        if np.abs(sample @ forces - resultant).sum() < NEGLIGIBLE:
             return 0.0
     tolerance = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
     solution = scipy.optimize.linprog(

@@ -7,6 +7,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from fenics_contact.obstacles.base import Sample
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
 
 __all__ = ["Curve"]
@@ -16,8 +17,8 @@ __all__ = ["Curve"]
 _SAMPLES_PER_POINT, _MIN_SAMPLES, _N_STARTS = 16, 1000, 3
 # Largest number of Newton or bisection steps: sufficient for bisection alone.
 _MAX_STEPS = 80
-# Relative to the curve length: equal parameters, and smallest distance with a direction.
-_SAME_PARAMETER_RATIO, _END_DISTANCE_RATIO = 1e-13, 1e-9
+# Difference of equal parameters relative to the curve length.
+_SAME_PARAMETER_RATIO = 1e-13
 # Smallest distance from the centre of curvature relative to the radius.
 _MIN_CENTRE_RATIO = 1e-6
 
@@ -58,7 +59,7 @@ class Curve:
         if not self._closed:
             length = np.linalg.norm(arm, axis=1)
             off = np.minimum(t, self._end - t) <= _SAME_PARAMETER_RATIO * self._end
-            off &= length > _END_DISTANCE_RATIO * self._end
+            off &= length > NEGLIGIBLE * self._end
             distance = np.where(off, length, distance)
             outward = np.where(off[:, None], arm / np.where(off, length, 1.0)[:, None], outward)
             along = np.stack([-outward[:, 1], outward[:, 0]], axis=1)

@@ -8,16 +8,14 @@ import numpy.typing as npt
 from fenics_contact.obstacles.base import Sample
 from fenics_contact.obstacles.refinement import refine, weighted_normals
 from fenics_contact.obstacles.search import FacetSearch
+from fenics_contact.tolerances import NEGLIGIBLE, ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["Facets"]
 
-# Relative to the size of the surface: smallest distance from an edge with a direction, difference
-# of equal distances (a point is then at an edge or corner), and largest resolved distance.
-_EDGE_RATIO, _SAME_RATIO = 1e-9, 1e-12
+# Largest resolved distance relative to the size of the surface. A negligible distance from an edge
+# has no direction; at an edge or corner distances from facets are equal up to round-off.
 _FAR_RATIO = 1e6
-# Smallest height of a facet with a normal relative to its longest edge.
-_MIN_HEIGHT_RATIO = 1e-10
 
 
 class Facets:
@@ -96,7 +94,7 @@ class Facets:
         pseudo = np.concatenate([pseudo, at_corners[self.facets]], axis=1)
         length = np.linalg.norm(pseudo, axis=2, keepdims=True)
         # Normals of two sheets back to back cancel.
-        pseudo = np.where(length > _MIN_HEIGHT_RATIO, pseudo, normals[:, None, :])
+        pseudo = np.where(length > NEGLIGIBLE, pseudo, normals[:, None, :])
         pseudo /= np.maximum(np.linalg.norm(pseudo, axis=2, keepdims=True), 1e-300)
         return pseudo, np.concatenate([boundary, boundary_points[self.facets]], axis=1)
 
@@ -107,7 +105,7 @@ class Facets:
         reach = np.linalg.norm(x, axis=1)
         scale = _FAR_RATIO * self.size / np.maximum(reach, _FAR_RATIO * self.size)
         x, rest = scale[:, None] * x, (1.0 - scale) * reach
-        facet = self._search.find_closest(x, self._distance, _SAME_RATIO * self.size)
+        facet = self._search.find_closest(x, self._distance, ROUND_OFF * self.size)
         projection, feature = self._project(x, facet)
         outward = self._normals[facet, feature]
         arm = x - projection
@@ -116,7 +114,7 @@ class Facets:
         side = np.where((height >= 0) | self._boundary[facet, feature], 1.0, -1.0)
         on_facet = feature == 0
         distance = np.where(on_facet, height, side * length)
-        far = ~on_facet & (length > _EDGE_RATIO * self.size)
+        far = ~on_facet & (length > NEGLIGIBLE * self.size)
         radius = np.where(far, distance, 1.0)
         slope = np.where(far[:, None], arm / radius[:, None], outward)
         across = np.eye(d) - np.einsum("ni,nj->nij", slope, slope)
@@ -144,7 +142,7 @@ class Facets:
         if d == 2:
             fraction, projection = fraction[:, 0], projections[:, 0]
             distances = np.linalg.norm(x[:, None, :] - corners, axis=2)
-            at_corner = distances <= _SAME_RATIO * self.size
+            at_corner = distances <= ROUND_OFF * self.size
             starts, ends = (fraction <= 0.0) | at_corner[:, 0], (fraction >= 1.0) | at_corner[:, 1]
             return projection, np.where(starts, 1, np.where(ends, 2, 0))
         normal = self._normals[facet, 0]
@@ -153,9 +151,9 @@ class Facets:
         rows = np.arange(len(x))
         distances = np.linalg.norm(x[:, None, :] - projections, axis=2)
         best = np.argmin(distances, axis=1)
-        inside &= distances[rows, best] > _SAME_RATIO * self.size
+        inside &= distances[rows, best] > ROUND_OFF * self.size
         position = fraction[rows, best]
-        reach = _SAME_RATIO * self.size / np.sqrt(square[rows, best])
+        reach = ROUND_OFF * self.size / np.sqrt(square[rows, best])
         starts, ends = position <= reach, position >= 1.0 - reach
         at_end = np.where(starts, 4 + best, 4 + (best + 1) % 3)
         feature = np.where(starts | ends, at_end, 1 + best)
@@ -182,7 +180,7 @@ def _facet_normals(corners: Array) -> tuple[Array, Mask]:
     else:
         normals = np.asarray(np.cross(spans[:, 0], spans[:, 1]), dtype=np.float64)
         longest = np.sum(spans**2, axis=2).max(axis=1)
-        valid = np.linalg.norm(normals, axis=1) > _MIN_HEIGHT_RATIO * longest
+        valid = np.linalg.norm(normals, axis=1) > NEGLIGIBLE * longest
     length = np.where(valid, np.linalg.norm(normals, axis=1), np.inf)
     return normals / length[:, None], valid
 

@@ -18,12 +18,10 @@ from fenics_contact.obstacles.base import (
 )
 from fenics_contact.obstacles.curve import Curve
 from fenics_contact.obstacles.meshed import as_points, fingerprint_of
+from fenics_contact.tolerances import NEGLIGIBLE
 from fenics_contact.types import Array
 
 __all__ = ["RigidProfile"]
-
-# Largest distance of points on the axis relative to the coordinates.
-_AXIS_DISTANCE_RATIO = 1e-9
 
 
 class RigidProfile(SampledObstacle):
@@ -152,7 +150,7 @@ class _Revolution:
         height = arm @ self._axis
         out = arm - height[:, None] * self._axis
         radius = np.linalg.norm(out, axis=1)
-        off_axis = radius > _AXIS_DISTANCE_RATIO * np.linalg.norm(arm, axis=1)
+        off_axis = radius > NEGLIGIBLE * np.linalg.norm(arm, axis=1)
         # On the axis, any normal direction is used.
         normal = np.cross(self._axis, np.eye(3)[np.argmin(np.abs(self._axis))])
         out[~off_axis] = normal / np.linalg.norm(normal)
@@ -182,7 +180,7 @@ class _Revolution:
 def _mirror_at_axis(points: Array) -> tuple[Array, bool]:
     """Mirror an open profile at the axis where it ends there; return whether it is closed."""
     size = np.abs(points).max()
-    starts, ends = (points[i, 0] <= _AXIS_DISTANCE_RATIO * size for i in (0, -1))
+    starts, ends = (points[i, 0] <= NEGLIGIBLE * size for i in (0, -1))
     mirror = points[::-1] * np.array([-1.0, 1.0])
     if starts and ends:
         return np.concatenate([points, mirror[1:-1]]), True

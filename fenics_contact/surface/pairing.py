@@ -33,14 +33,10 @@ from fenics_contact.surface.projection import (
 )
 from fenics_contact.surface.rays import BEHIND, Hits, Rays
 from fenics_contact.surface.surface import SurfaceQuadrature
-from fenics_contact.tolerances import FLAT
+from fenics_contact.tolerances import EVALUATION_ROUND_OFF, FLAT
 from fenics_contact.types import Array, Index
 
 __all__ = ["Pairing", "PresentHits"]
-
-
-# Round-off of a distance relative to the coordinates.
-_COORDINATE_ROUND_OFF = 16 * np.finfo(float).eps
 
 
 @dataclass(frozen=True)
@@ -83,7 +79,7 @@ class Pairing:
         mesh = space.mesh
         self._comm, self._d = mesh.comm, mesh.topology.dim
         self._obstacle, self._quadrature = obstacle, quadrature
-        self.round_off = _COORDINATE_ROUND_OFF * global_max(mesh.comm, np.abs(mesh.geometry.x))
+        self.round_off = EVALUATION_ROUND_OFF * global_max(mesh.comm, np.abs(mesh.geometry.x))
         self.rays = rays = Rays(obstacle, quadrature, space)
         self._slave, self._master = rays.slave.facets, rays.master.facets
         self._sides, self._facet, self._space = (rays.slave, rays.master), rays.facet, space

@@ -16,14 +16,11 @@ from mpi4py import MPI
 
 from fenics_contact.systems.partition import Partition, norms_by_part
 from fenics_contact.systems.reference_scales import ReferenceScales
-from fenics_contact.tolerances import MIN_FORCE, ROUND_OFF
+from fenics_contact.tolerances import EVALUATION_ROUND_OFF, MIN_FORCE, ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
 __all__ = ["MAX_ROUND_OFF_RESIDUAL_RATIO", "InitialForces", "Norms", "Parts"]
 
-# Round-off of K u relative to the summed magnitudes of its terms; rigid motions leave up to 14 eps
-# on random tetrahedra of degree 2, and 34 eps on a distorted mesh.
-_KU_ROUND_OFF = 40 * np.finfo(float).eps
 # Largest displacement whose round-off is allowed, relative to the size of the body or to its
 # displacement at the start: a diverging rigid motion must not widen the tolerance.
 _MAX_DISPLACEMENT_RATIO = 1e3
@@ -189,10 +186,10 @@ class Parts:
         terms = np.where(fixed, terms, np.minimum(terms, bound))
         # A load at a zero of a sine is round-off.
         least = np.append(self.scales.min_force, np.zeros(len(self.motions)))
-        loaded = loads > np.where(fixed, _KU_ROUND_OFF * least, 0.0)
+        loaded = loads > np.where(fixed, EVALUATION_ROUND_OFF * least, 0.0)
         # A free body without load may touch an obstacle by the round-off of its position only.
         terms = np.where(loaded | fixed, terms, np.maximum(terms, least))
-        round_off = np.maximum(_KU_ROUND_OFF * terms, MIN_FORCE)
+        round_off = np.maximum(EVALUATION_ROUND_OFF * terms, MIN_FORCE)
         # The softer body limits the accuracy of a contact force.
         limits = np.tile(round_off, (len(contacts), 1))
         for row, pairs in zip(limits, self.pairs, strict=True):
@@ -201,7 +198,7 @@ class Parts:
         active = local_force > np.maximum(limits, ROUND_OFF * force)
         limited = loaded | (active.any(axis=0) & ~fixed)
         # Unloaded contact forces leave their round-off.
-        unloaded = _KU_ROUND_OFF * np.maximum(start.contact - local_force, 0.0).max(
+        unloaded = EVALUATION_ROUND_OFF * np.maximum(start.contact - local_force, 0.0).max(
             axis=0, initial=0.0
         )
         cap, local_cap = (
