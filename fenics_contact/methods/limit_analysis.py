@@ -96,17 +96,17 @@ def support_stiffness(
     overloads: Sequence[Overload],
     scales: ReferenceScales,
     slip_ratio: float,
-) -> list[Array]:
-    """Return the stiffness of tangential springs that support overloaded bodies.
+) -> list[Array | None]:
+    """Return the stiffness of tangential springs that support overloaded bodies. Collective.
 
     Bodies slide by ``slip_ratio`` of their size against them, with the present friction bound.
     Raising the bound instead would also allow more friction across the sliding direction, and in a
     groove reduce the pressure.
 
     Returns:
-        For each contact, (n_points, gdim, gdim) (stress/length).
+        For each contact, (n_points, gdim, gdim) (stress/length); None without springs.
     """
-    result = []
+    result: list[Array | None] = []
     for number, operator in enumerate(operators):
         contact, total = operator.contact, np.zeros(operator.contact.quadrature.n_points)
         if contact.law.has_friction:
@@ -115,6 +115,9 @@ def support_stiffness(
             for overload in overloads:
                 in_group = scales.group_of_points(number) == overload.group
                 total += np.where(in_group, (overload.factor - 1.0) * bound / slip, 0.0)
+        if not global_max(contact.surface.mesh.comm, total) > 0.0:
+            result.append(None)
+            continue
         normal = contact.values.normal
         tangential = np.eye(normal.shape[1]) - np.einsum("qi,qj->qij", normal, normal)
         result.append(total[:, None, None] * tangential)

@@ -208,13 +208,6 @@ def _is_final(overload: Overload | None, last: Overload | None) -> bool:
     return abs(balanced - before) < _FINAL_CHANGE_RATIO * (1.0 - balanced)
 
 
-def _has_support(contact: Contact) -> bool:
-    """Return whether springs support the contact against an overload. Collective."""
-    support = contact.effective_law.support
-    size = 0.0 if support is None else np.abs(support).max(initial=0.0)
-    return global_max(contact.surface.mesh.comm, np.array([size])) > 0.0
-
-
 class _Minimisation(SnesMethod):
     """Newton's method for the subproblems, with the matrix of H₀.
 
@@ -247,9 +240,10 @@ class _Minimisation(SnesMethod):
             equations.assemble(J, equations.stiffnesses(everywhere=True))
             return
         # If all points slip, bodies constrained by friction have unconstrained modes.
-        unsupported = (o for o in equations.system.operators if not _has_support(o.contact))
         springs = (
-            o.springs(o.contact.values.springs(0.0, _SLIP_STIFFNESS_RATIO)) for o in unsupported
+            o.springs(o.contact.values.springs(0.0, _SLIP_STIFFNESS_RATIO))
+            for o in equations.system.operators
+            if o.contact.effective_law.support is None
         )
         equations.assemble(J, chain(equations.tangents(), springs))
 
