@@ -29,7 +29,6 @@ from fenics_contact.methods.equations import Equations
 from fenics_contact.methods.limit_analysis import Overload, support_stiffness
 from fenics_contact.methods.method import SnesMethod, SolverContext, StandaloneMethod
 from fenics_contact.parallel import global_max
-from fenics_contact.tolerances import EVALUATION_ROUND_OFF
 from fenics_contact.types import Array
 
 __all__ = ["TrescaFixedPoint"]
@@ -47,7 +46,9 @@ _OPTIONS = {
 }
 # Newton steps without line search, for decreases below the round-off of the energy.
 _FINISH = _OPTIONS | {"snes_max_it": 5, "snes_linesearch_type": "basic"}
-_LINE_SEARCH_RTOL = 1e-6  # residual by forces below which a decrease of energy may be round-off
+# Round-off of the energy by its terms, and residual by the forces below which a decrease of the
+# energy may be round-off. With 40 eps the search ends too early at a stiffness of 1e5 E/h.
+_ENERGY_ROUND_OFF, _LINE_SEARCH_RTOL = 10 * np.finfo(float).eps, 1e-6
 _MAX_CYCLES = 200
 _MAX_ITERATIONS = 1000  # Newton iterations of all cycles
 _MAX_STALLS = 20  # consecutive cycles without a lower residual
@@ -281,6 +282,6 @@ class _Search(_Minimisation):
             return reason
         decrease = self._last_energy - self._energy
         self._last_energy = self._energy
-        if decrease <= EVALUATION_ROUND_OFF * self._equations.energy_size():
+        if decrease <= _ENERGY_ROUND_OFF * self._equations.energy_size():
             return int(_REASONS.DIVERGED_LINE_SEARCH)
         return ongoing
