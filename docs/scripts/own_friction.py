@@ -30,7 +30,8 @@ facets = mesh.locate_entities_boundary(
     msh, 1, lambda x: np.isclose(x[1], 0) | np.isclose(x[1], 0.1)
 )
 y = mesh.compute_midpoints(msh, 1, facets)[:, 1]
-tags = mesh.meshtags(msh, 1, facets, np.where(y < 0.05, BOTTOM, TOP).astype(np.int32))
+sides = np.select([np.isclose(y, 0), np.isclose(y, 0.1)], [BOTTOM, TOP], 0)  # 0: the ends
+tags = mesh.meshtags(msh, 1, facets, sides.astype(np.int32))
 V = fem.functionspace(msh, ("Lagrange", 1, (2,)))
 u, v = fem.Function(V), ufl.TestFunction(V)
 ds = ufl.Measure("ds", domain=msh, subdomain_data=tags)
@@ -41,7 +42,9 @@ contact = fc.Contact(u, fc.ContactSurface(msh, tags, BOTTOM), floor, law)
 problem = fc.ContactProblem(F, u, contacts=[contact])
 problem.solve()
 problem.commit()
+force = contact.resultants().force
 found, expected = contact.gather()["slip"], (PULL / WEIGHT - 0.3) / law.rate
 if msh.comm.rank == 0:
     print(f"dragged by {found.mean():.6g} mm; (T/N - μ)/a = {expected:.6g} mm")
+    assert np.allclose(force, (-PULL, WEIGHT))
     assert np.allclose(found, expected, rtol=1e-3)  # the block itself is not quite rigid

@@ -108,10 +108,13 @@ class StandaloneMethod(Method):
     """A method with its own nonlinear solvers, registered in `METHODS`.
 
     `solve` starts from ``equations.solution`` and overwrites it, and restores the data of the
-    contacts; it has converged if ``equations.is_converged()`` after ``equations.residual``.
-    Newton's method of `SolverContext.newton` does both: call `Newton.attach` before every solution,
-    and return the result of its ``solve``. It fails after 14 iterations without a lower residual
-    (`ActiveSetMonitor.n_stalled`), so that another method can take over.
+    contacts; it has converged if ``equations.is_converged()`` after ``equations.residual``. Reasons
+    are those of SNES; ``DIVERGED_LINE_SEARCH`` is reported as "no progress". An iteration without
+    SNES assembles ``equations.matrix(True)`` by `Equations.assemble_tangent`, and solves with
+    ``equations.solvers[True]``. Newton's method of `SolverContext.newton` does all of this: call
+    `Newton.attach` before every solution, and return the result of its ``solve``. It fails after 14
+    iterations without a lower residual (`ActiveSetMonitor.n_stalled`), so that another method can
+    take over.
 
     Attributes:
         is_newton_solution: Whether Newton's method computed the last solution, near which the
