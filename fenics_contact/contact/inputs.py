@@ -396,7 +396,8 @@ class Inputs:
         text = (
             f"{self._name}: the normal from the body to the obstacle points into the body at every "
             "point of Γc: reverse it (that of a HalfSpace points out of it, to the body: up for a "
-            "floor; a Ball or Cylinder around the body has inside=True)"
+            "floor; a Ball or Cylinder around the body has inside=True; the points of a "
+            "RigidProfile have the obstacle on their left)"
         )
         size = global_max(comm, x) - global_min(comm, x)
         if depth > _DEEP_PENETRATION_RATIO * size and not gap_prescribed:
