@@ -10,13 +10,18 @@ import warnings
 
 import numpy as np
 import pytest
+import ufl
+from dolfinx import fem
 from mpi4py import MPI
 
 import fenics_contact as fc
 from benchmarks import random_scenes
+from fenics_contact.elasticity import LinearElastic
 from fenics_contact.types import Array
 from scenes.blocks import BOTTOM, LEFT, TOP
+from scenes.bodies import Bodies, boxes
 from scenes.comparison import assert_raised_on_all_ranks, is_close
+from scenes.tags import at_coordinate, at_interface
 from scenes.unrelated_bodies import Box, SceneWithUnrelatedBodies
 from verification.fuzz_setup import run_history
 
@@ -211,3 +216,36 @@ def test_a_load_is_removed_after_a_restart(options):
     assert problem.solve().iterations <= 2
     left = COMM.allreduce(np.abs(problem.u.x.array).max(initial=0.0), op=MPI.MAX)
     assert left <= 40 * np.finfo(float).eps * 0.1
+
+
+@pytest.mark.parametrize("load", [1e-3, 1e-8, 1e-10])
+@pytest.mark.parametrize("method", [None, "lbfgs"])
+def test_stiff_free_blocks_carry_the_small_load_of_a_soft_one(method, load):
+    """Four free blocks on a floor, the uppermost 1e6 times softer, with a load on it.
+
+    Reference: statics, to 1e-6. The round-off of the positions of stiff bodies, as a force, is as
+    large as the least load, but bears none of it.
+    """
+    n = 4
+    axes = [
+        [np.linspace(-0.4 + 0.05 * k, 0.4 - 0.05 * k, 4), np.linspace(k, k + 1.0, 4)]
+        for k in range(n)
+    ]
+    faces = {1: at_coordinate(1, 0.0), 2: at_coordinate(1, float(n))}
+    for k in range(1, n):
+        faces |= {10 + k: at_interface(1, k, above=True), 20 + k: at_interface(1, k, above=False)}
+    stack = Bodies(boxes(axes, faces), 1.0, 0.3)
+    modulus = fem.Function(fem.functionspace(stack.mesh, ("DG", 0)))
+    for k in range(n):
+        cells = stack.cells(lambda x, k=k: (x[:, -1] > k) & (x[:, -1] < k + 1))
+        modulus.x.array[cells] = 1e6 if k < n - 1 else 1.0
+    stack.F = LinearElastic(stack.u, modulus, 0.3, "plane strain").residual(stack.v)
+    traction = load * ufl.as_vector((0.05, -1.0))
+    stack.F -= ufl.dot(traction, stack.v) * stack.ds(2)
+    law = fc.Coulomb(0.3)
+    contacts = [stack.contact(1, fc.HalfSpace((0, 0), (0, 1)), law, name="floor")]
+    for k in range(1, n):
+        contacts.append(stack.contact(10 + k, 20 + k, law, name=f"joint {k}"))
+    step = stack.problem(*contacts, method=method).solve()
+    for result in step.contacts.values():
+        assert result.normal_force == pytest.approx(0.5 * load, rel=1e-6)

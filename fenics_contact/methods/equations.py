@@ -300,18 +300,19 @@ class Equations:
     def stiffnesses(self, *, everywhere: bool) -> Iterator[PETSc.Mat]:
         """Yield αK_n + φK_t of the evaluated contacts; ``everywhere``: all of Γc sticks.
 
-        Open points whose gap is zero, as between bodies without load, resist the next step: they
-        stick.
+        Of contacts without history, open points whose gap is zero stick: the bodies touch at rest,
+        and resist the first load.
         """
         for number, operator in enumerate(self.system.operators):
             contact = operator.contact
             normal = tangential = np.ones(contact.quadrature.n_points)
             if not everywhere:
                 status, size = contact.status, self.full.scales.size_at_points(number)
-                touches = (status == Status.OPEN) & (contact.gap <= NEGLIGIBLE * size)
-                closed, sticks = (status != Status.OPEN), (status == Status.STICK)
-                normal = np.where(closed | touches, 1.0, _OPEN_STIFFNESS_RATIO)
-                tangential = np.where(sticks | touches, 1.0, _OPEN_STIFFNESS_RATIO)
+                touches = np.abs(contact.gap) <= NEGLIGIBLE * size
+                touches &= contact.states.committed.points is None
+                ratio = np.where(touches, 1.0, _OPEN_STIFFNESS_RATIO)
+                normal = np.where(status != Status.OPEN, 1.0, ratio)
+                tangential = np.where(status == Status.STICK, 1.0, ratio)
             springs = contact.values.springs(self._alpha * normal, self._phi * tangential)
             yield operator.springs(springs)
 

@@ -187,9 +187,9 @@ class Parts:
         # A load at a zero of a sine is round-off.
         least = np.append(self.scales.min_force, np.zeros(len(self.motions)))
         loaded = loads > np.where(fixed, EVALUATION_ROUND_OFF * least, 0.0)
-        # A free body without load may touch an obstacle by the round-off of its position only.
-        terms = np.where(loaded | fixed, terms, np.maximum(terms, least))
         round_off = np.maximum(EVALUATION_ROUND_OFF * terms, MIN_FORCE)
+        untouched = self._of_untouched_groups(EVALUATION_ROUND_OFF * least, loaded, local_force)
+        round_off = np.where(fixed, round_off, np.maximum(round_off, untouched))
         # The softer body limits the accuracy of a contact force.
         limits = np.tile(round_off, (len(contacts), 1))
         for row, pairs in zip(limits, self.pairs, strict=True):
@@ -224,6 +224,24 @@ class Parts:
         of_bodies = np.array([residuals, force, floor, np.where(significant, round_off, 0.0)])
         residual, force, floor, round_off = np.concatenate([of_bodies, of_contacts], axis=1)
         return Norms(residual, force, floor, round_off, n)
+
+    def _of_untouched_groups(self, negligible: Array, loaded: Mask, contacts: Array) -> Array:
+        """Return the round-off of positions as a force where there is no other force, (n_bodies,).
+
+        Bodies without load may touch by the round-off of their positions only. It is a force on the
+        softest body of a group, and 0 for a group with a load or with larger contact forces.
+
+        Args:
+            negligible: Round-off of positions times stiffness, (n_bodies,) (force).
+            loaded: Mask of the loaded bodies, (n_bodies,).
+            contacts: Contact forces, (n_contacts, n_bodies) (force).
+        """
+        group, softest = self.scales.group, np.full(self.scales.n_groups, np.inf)
+        np.minimum.at(softest, group[: self.scales.n_bodies], negligible[: self.scales.n_bodies])
+        force = np.where(loaded, np.inf, contacts.max(axis=0, initial=0.0))
+        largest: Array = np.zeros(self.scales.n_groups)
+        np.maximum.at(largest, group, force)
+        return np.asarray(np.where(largest <= softest, softest, 0.0)[group])
 
 
 def _measure_contact(
