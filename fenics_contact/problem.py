@@ -261,8 +261,7 @@ class ContactProblem:
         points = PairIteration(self.full, self.contacts if updates_pairs else [])
         increment = Increment(recover_interior, points)
         self._check_committed()
-        for contact, state in zip(self.contacts, self.state.contacts, strict=True):
-            contact.states.check_unchanged(state)
+        self.state.check_contacts(self.contacts)
         is_first, self._is_first = self._is_first, False
         if is_first:
             for contact in self.contacts:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fenics_contact.checks.energy import EnergyState
+from fenics_contact.contact.contact import Contact
 from fenics_contact.contact.states import ContactState, ContactTrial
 from fenics_contact.types import Array
 
@@ -34,6 +36,11 @@ class State:
     change: Array | None = None
     interior: Array | None = None
     increment: int = 0
+
+    def check_contacts(self, contacts: Sequence[Contact]) -> None:
+        """Raise a ValueError if a contact has been committed elsewhere since."""
+        for contact, state in zip(contacts, self.contacts, strict=True):
+            contact.states.check_unchanged(state)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,13 @@ from mpi4py import MPI
 
 import fenics_contact as fc
 from scenes.blocks import block
-from scenes.comparison import assert_raised_on_all_ranks, is_close, nodal_values, point_values
+from scenes.comparison import (
+    assert_raised_on_all_ranks,
+    is_close,
+    nodal_values,
+    point_values,
+    shared_folder,
+)
 from scenes.stacks import FLOOR, LOWER, ROOF, UPPER, stack
 
 COMM = MPI.COMM_WORLD
@@ -153,8 +159,11 @@ def test_new_problem_continues_a_history():
         assert abs(getattr(two.energy, name) - getattr(one.energy, name)) < 1e-9 * scale, name
 
 
-def test_history_continued_by_another_problem_is_refused():
-    """Energies and predictors of the problem would be outdated. The error changes no state."""
+def test_history_continued_by_another_problem_is_refused(tmp_path):
+    """Energies and predictors of the problem would be outdated. The error changes no state.
+
+    A checkpoint would have the displacement of one problem and the tractions of the other.
+    """
     scene = block("quadrilateral", n=4, up=-5.0)
     contact = scene.contact(fc.Coulomb(0.3))
     first, second = (
@@ -164,7 +173,13 @@ def test_history_continued_by_another_problem_is_refused():
     first.solve()
     first.commit()
     rows = contact.history.rows()
-    assert_raised_on_all_ranks(second.solve, ValueError, "another problem", "new ContactProblem")
+    words = ("another problem", "new ContactProblem")
+    assert_raised_on_all_ranks(second.solve, ValueError, *words)
+    second.restore()
+    path = shared_folder(tmp_path) / "state.npz"
+    assert_raised_on_all_ranks(lambda: fc.checkpoint.save(second, path), ValueError, *words)
+    assert not path.exists()
+    first.restore()
     assert is_close(contact.history.rows(), rows, 0.0)
     first.solve()
     first.commit()

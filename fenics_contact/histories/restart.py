@@ -31,9 +31,11 @@ def committed_rows(problem: ContactProblem) -> Array:
         unknowns retained by static condensation, and of those with Dirichlet conditions.
 
     Raises:
-        ValueError: The present state is not that of the last commit.
+        ValueError: The present state is not that of the last commit, or another problem has
+            committed a contact.
     """
     full, state = problem.full, problem.state
+    state.check_contacts(problem.contacts)
     differs = problem.present.interior is not state.interior or not np.array_equal(
         full.state(), state.unknowns
     )
