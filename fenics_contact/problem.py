@@ -359,7 +359,8 @@ class ContactProblem:
         present = self.present
         if present.interior is None:
             return None
-        completed, verdict = self._increments.recover_interior(present, self.state.increment + 1)
+        number = self.increment + (self._trial is not None)
+        completed, verdict = self._increments.recover_interior(present, number)
         if isinstance(completed, State):
             self.state = completed
         else:

@@ -309,6 +309,26 @@ def test_results_do_not_depend_on_units(method):
         assert is_close(traction, results[0][2], 1e-9)
 
 
+def test_failed_recovery_of_the_interior_names_its_increment(monkeypatch):
+    """A wrong interior displacement is refused, as of increment 2 before and after its commit."""
+    setup = BlockOnBall(condensation=True)
+    problem = setup.problem
+    for displacement in PATH[:2]:
+        if problem.present.interior is not None:
+            problem.complete()
+        setup.set_top_displacement(*displacement)
+        step = problem.solve(recover_interior=False)
+        if problem.increment == 0:
+            problem.commit()
+    assert not step.complete
+    with monkeypatch.context() as patch:
+        patch.setattr(problem.solver.system, "complete", lambda interior: None)
+        for _ in range(2):  # the trial state, then the committed one
+            assert_raised_on_all_ranks(problem.complete, fc.NotConverged, "increment 2:")
+            problem.commit()
+    assert problem.complete().failures == []
+
+
 @pytest.mark.parametrize("method", ["lbfgs", "newton"])
 def test_failed_increment_changes_nothing(method):
     """A failed increment changes neither u, nor the history, nor the following increments."""

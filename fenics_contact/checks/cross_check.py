@@ -37,8 +37,8 @@ class CrossCheck:
             by_points, by_form = self._forces(contact)
             tangential = np.linalg.norm(values.tangential_stiffness, axis=(1, 2))
             stiffness = values.normal_stiffness + tangential
-            size = contact.pairs.displacement_size(values.jump) + np.abs(values.initial_gap)
-            sensitivity = float(global_sum(comm, contact.measure @ (stiffness * size)))
+            magnitude = contact.pairs.displacement_size(values.jump) + np.abs(values.initial_gap)
+            sensitivity = float(global_sum(comm, contact.measure @ (stiffness * magnitude)))
             d = values.x.shape[1]
             sizes = (max_norm(comm, f.reshape(-1, d)) for f in (by_points - by_form, by_points))
             residual, force = (float(size) for size in sizes)
@@ -64,11 +64,8 @@ class CrossCheck:
         for item in (vector, forces):
             item.destroy()
         if contact.name not in self._forms:
-            displacement = (
-                contact.u
-                if contact.contact_kinematics.is_rigid and not contact.motions
-                else kinematics.local_jump
-            )
+            is_own = kinematics.is_rigid and not contact.motions
+            displacement = contact.u if is_own else kinematics.local_jump
             form = contact.form_at(displacement, ufl.TestFunction(contact.u.function_space))
             self._forms[contact.name] = compile_form(-form, contact.entity_maps)
         return by_points, assemble_values(self._forms[contact.name])[: by_points.size].copy()

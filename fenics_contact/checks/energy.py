@@ -144,11 +144,8 @@ class EnergyState:
                 add(3, contact.measure * contact.values.dissipated, groups)
                 # At the start the committed tractions, not the multipliers that replace them.
                 slip, normal = contact.slip_vector(), contact.values.normal
-                first = (
-                    contact.values.carried_traction
-                    if contact.contact_kinematics.is_finite
-                    else start[0]
-                )
+                finite = contact.contact_kinematics.is_finite
+                first = contact.values.carried_traction if finite else start[0]
                 ends = np.stack([first, end[0]])
                 sizes = contact.measure * np.linalg.norm(ends, axis=2).max(axis=0)
                 # Forces below round-off may have any direction.

@@ -223,9 +223,8 @@ class Deviation:
         deformed = np.where(contact.pairs.paired, values.gap, 0.0) + change
         size = np.linalg.norm(values.x, axis=1) + contact.quadrature.facet_sizes
         tolerance = ROUND_OFF * size
-        if (
-            not contact.contact_kinematics.is_rigid
-        ):  # the deviation of closed points is due to faceting
+        if not contact.contact_kinematics.is_rigid:
+            # The deviation of closed points is due to faceting.
             tolerance += max_norm(contact.surface.mesh.comm, np.nan_to_num(change[closed]))
         closing = known & ~closed & (deformed < -tolerance)
         gap = np.where(closing, deformed, 0.0)

@@ -58,8 +58,10 @@ class ObstacleCheck:
         if curvature is not None and not contact.obstacle.is_flat:
             depth = global_max(comm, (contact.values.penetration * curvature)[closed])
         has_friction = contact.law.has_friction and comm.allreduce(int(closed.any())) > 0
-        turn = contact.contact_kinematics.rotation_in_increment(contact.values)
-        angle = abs(turn.angle) if has_friction else 0.0
+        angle = 0.0
+        if has_friction:
+            turn = contact.contact_kinematics.rotation_in_increment(contact.values)
+            angle = abs(turn.angle)
         return cls(type(contact.obstacle).__name__, error, depth, angle)
 
     def conditions(self, contact: str) -> list[Condition]:

@@ -48,12 +48,9 @@ class Verifier:
         self._full, self._motions = full, motions
         self._cross_check = CrossCheck(full.contacts) if cross_check else None
         self._contacts, self._comm = full.contacts, full.unknowns.comm
-        self._obstacles = TunnellingCheck(
-            [c for c in full.contacts if c.contact_kinematics.is_rigid]
-        )
-        self._bodies = TunnellingCheck(
-            [c for c in full.contacts if not c.contact_kinematics.is_rigid]
-        )
+        self._rigid = rigid = [c for c in full.contacts if c.contact_kinematics.is_rigid]
+        self._obstacles = TunnellingCheck(rigid)
+        self._bodies = TunnellingCheck([c for c in full.contacts if c not in rigid])
         self._warned_errors: dict[str, float] = {}
         self._warned_round_off: set[str] = set()
         self._warned_resolution: set[tuple[str, str]] = set()
@@ -121,11 +118,7 @@ class Verifier:
             laws={c.name: check_laws(c) for c in self._contacts} if laws else {},
             enforcement={c.name: c.enforcement_error() for c in augmented},
             enforcement_tolerance={c.name: c.tolerance for c in augmented},
-            obstacles={
-                c.name: ObstacleCheck.of(c)
-                for c in self._contacts
-                if laws and c.contact_kinematics.is_rigid
-            },
+            obstacles={c.name: ObstacleCheck.of(c) for c in self._rigid if laws},
             tunnelling=tunnelling,
             small_displacement_error=(
                 estimate_small_displacement_error(self._contacts, self._full.scales, respond)

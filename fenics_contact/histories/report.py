@@ -336,9 +336,7 @@ def _add_state(
         checked += ["the contact laws at every point"] if step.verdict.laws else []
         checked += ["the penetration left by multipliers"] if step.verdict.enforcement else []
         checked += ["the rigid obstacles"] if step.verdict.obstacles else []
-        small = [
-            c.name for c in problem.contacts if not c.contact_kinematics.is_finite
-        ]  # small displacements
+        small = [c.name for c in problem.contacts if not c.contact_kinematics.is_finite]
         known = step.verdict.small_displacement_error
         checked += ["that displacements are small"] if any(n in known for n in small) else []
         residual = f"The residual is {step.verdict.relative_residual:.1e} of the forces."

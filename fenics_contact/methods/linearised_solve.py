@@ -169,8 +169,8 @@ def solve_response(
         for operator, traction in zip(system.operators, tractions, strict=True):
             operator.add_force(rhs, traction)
         rhs.array[system.constrained] = 0.0
-        size = _size_by_group(equations, rhs.array_r) / system.bulk.scale
-        rhs.array[:] /= -size * system.bulk.scale  # the matrix does not couple groups
+        size = _size_by_group(equations, rhs.array_r)
+        rhs.array[:] /= -size  # the matrix does not couple groups
         ksp.setOperators(matrix)
         ksp.setType(PETSc.KSP.Type.FGMRES)
         ksp.getPC().setType("python")
@@ -180,7 +180,7 @@ def solve_response(
         dense.raise_stored_error(equations.solvers[consistent])
         if not ksp.getResidualNorm() <= _MAX_RESPONSE_RESIDUAL * max(1.0, rhs.norm()):
             solution.set(np.nan)
-        solution.array[:] *= size
+        solution.array[:] *= size / system.bulk.scale
         return [operator.jump(solution.array_r) for operator in system.operators]
     finally:
         system.diagonal = diagonal

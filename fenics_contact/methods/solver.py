@@ -489,7 +489,7 @@ class Solver:
         """
         yield self.method
         if fallback and balance and not self._full.bulk.linear:
-            self.system.set_state(guess)  # the solution is verified if no method follows
+            self.system.set_state(guess)
             self._full.evaluate()
             check_balance(self.equations.motions, self._full.load, self._full.operators)
         if fallback and self.can_fall_back():
