@@ -11,6 +11,7 @@ import fenics_contact as fc
 from fenics_contact.elasticity import LinearElastic
 from scenes.blocks import BOTTOM, TOP, block_mesh
 from scenes.elasticity import dirichlet_bc
+from scenes.stacks import FLOOR, ROOF, joint, stack
 
 BLOCKS, GAP, HEIGHT, PLATE = 3, 0.002, 0.4, 0.3
 DEPTH = 0.01 + (BLOCKS + 1) * GAP
@@ -68,6 +69,43 @@ def test_squeezed_block_stays_in_the_stack() -> None:
     forces = [contact.resultants().force[1] for contact in contacts]
     assert np.allclose(np.abs(forces), again, rtol=1e-3)
     assert np.abs(u.x.array[::2]).max() < 0.01
+
+
+@pytest.mark.two_ranks
+def test_block_beside_the_stack_is_no_solution() -> None:
+    """Blocks on the middle of each other: the second pressing has the force of the first, to 3 %.
+
+    The upper block has been dragged along by 0.05 in between, and springs back a little. The same
+    vertical force acts in every joint (1e-3: friction on inclined surfaces). A block beside the
+    stack, 0.91 away, was accepted as a solution without forces.
+    """
+    widths = (1.4, 1.0, 0.9, 0.8, 1.4)
+    heights = (PLATE, HEIGHT, HEIGHT, HEIGHT, PLATE)
+    bodies = stack("quadrilateral", (5, 3, 4, 5, 6), heights, widths=widths, gap=GAP, nu=0.3)
+    along, down = bodies.constant(), bodies.constant()
+    bodies.prescribe(FLOOR, 0, 1)
+    bodies.prescribe(ROOF, 0, value=along)
+    bodies.prescribe(ROOF, 1, value=down)
+    law = fc.Coulomb(0.1)
+    contacts = [joint(bodies, j, law, kinematics="finite") for j in range(1, BLOCKS + 2)]
+    problem = bodies.problem(*contacts)
+
+    def move(value: fem.Constant, start: float, end: float) -> list[float]:
+        def load(t: float) -> None:
+            value.value = t
+
+        for _ in fc.increments(problem, load, start, end, steps=3):
+            pass
+        return [float(contact.resultants().force[1]) for contact in contacts]
+
+    first = move(down, 0.0, -DEPTH)
+    move(along, 0.0, 0.05)
+    assert move(down, -DEPTH, 0.01) == [0.0] * len(contacts)
+    move(along, 0.05, 0.0)
+    again = move(down, 0.01, -DEPTH)
+    assert np.allclose(again, again[0], rtol=1e-3)
+    assert again == pytest.approx(first, rel=0.03)
+    assert np.abs(bodies.u.x.array[::2]).max() < 0.06
 
 
 def _block(x: float, y: float, width: float, height: float, n: tuple[int, int]) -> tuple:
