@@ -16,8 +16,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
-import time
 from pathlib import Path
 
 import numpy as np
@@ -43,19 +41,7 @@ def linear(made: joint.BoltedJoint, repeat: int) -> float:
     u = made.u.copy()
     v = ufl.TestFunction(u.function_space)
     F = residual(u, v, joint.E, joint.NU) - v[0] * ufl.dx
-    operators = made.problem.full.operators
-    ties = [o.springs(o.contact.values.springs(1.0, 1.0)) for o in operators]  # k_n and k_t
-    times = []
-    for _ in range(repeat + 1):
-        start = _now()
-        costs.solve_once(u, F, made.problem.full.bcs, ties=ties)
-        times.append(_now() - start)
-    return statistics.median(times[1:])  # the first run compiles the forms
-
-
-def _now() -> float:
-    COMM.Barrier()
-    return time.perf_counter()
+    return costs.time_of_tied_bodies(made.problem, u, F, repeat)
 
 
 def run_in_process(size: float, degree: int, repeat: int) -> None:
@@ -66,25 +52,25 @@ def run_in_process(size: float, degree: int, repeat: int) -> None:
     unit = linear(made, repeat)
     common = {"dofs": n_dofs(made.u.function_space), "ranks": COMM.size}
     rows: list[Row] = []
-    start = _now()
+    start = costs.now()
     for step in made.increments(PULL_END, steps=round(PULL_END / INCREMENT)):
-        seconds = _now() - start
+        seconds = costs.now() - start
         preload = made.pull.value == 0.0
         what = "preload" if preload else f"pull {float(made.pull.value):g} N"
         rows.append({"increment": what, "iterations": step.iterations, "method": step.method})
         rows[-1] |= {"seconds": seconds, "linear solves": seconds / unit}
-        start = _now()
+        start = costs.now()
     plates, head, _ = (contact.resultants() for contact in made.contacts)
     limit = joint.FRICTION * (plates.normal_force + head.normal_force)
     made.load(PRELOAD_END + OVERLOAD_RATIO * limit / 1000.0)
-    start = _now()
+    start = costs.now()
     try:
         step = made.problem.solve()
         iterations, outcome = step.iterations, "solved"
     except fc.NotConverged as error:
         iterations = error.iterations
         outcome = "refused: " + ("overload" if "overload:" in str(error) else "no solution found")
-    seconds = _now() - start
+    seconds = costs.now() - start
     what = f"pull {float(made.pull.value):.0f} N, above the friction limit"
     rows.append({"increment": what, "iterations": iterations, "method": outcome})
     rows[-1] |= {"seconds": seconds, "linear solves": seconds / unit}

@@ -8,6 +8,8 @@ consistent tangent) and LU by MUMPS or GMRES with GAMG.
 from __future__ import annotations
 
 import argparse
+import statistics
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -151,6 +153,33 @@ def linear_solve(body: problems.ContactScene, degree: int, kind: str = "direct")
         for i in range(len(u))
     ]
     return solve_once(u, residual, bcs, kind)
+
+
+def now() -> float:
+    """Return the time when all ranks are here (s). Collective."""
+    MPI.COMM_WORLD.Barrier()
+    return time.perf_counter()
+
+
+def time_of_tied_bodies(
+    problem: fc.ContactProblem, u: fem.Function, residual: ufl.Form, repeat: int
+) -> float:
+    """Return the median time of one linear solve of bodies tied at all contacts (s). Collective.
+
+    Args:
+        problem: A problem, whose contacts are evaluated.
+        u: Displacement, which becomes the solution.
+        residual: Residual form of the bodies, linear in u.
+        repeat: Number of runs.
+    """
+    operators = problem.full.operators
+    ties = [o.springs(o.contact.values.springs(1.0, 1.0)) for o in operators]  # k_n and k_t
+    times = []
+    for _ in range(repeat + 1):
+        start = now()
+        solve_once(u, residual, problem.full.bcs, ties=ties)
+        times.append(now() - start)
+    return statistics.median(times[1:])  # the first run compiles the forms
 
 
 def solve_once(

@@ -125,6 +125,11 @@ def _cost(folder: Path) -> list[str]:
     joint = report.read(folder / "bolted_joint/bolted_joint.csv")
     refused = [row for row in joint if row["method"].startswith("refused")]
     solved = [float(row["linear solves"]) for row in joint if row not in refused]
+    rollers = report.read(folder / "bearing/bearing.csv")
+    finest = [row for row in rollers if row["dofs"] == rollers[-1]["dofs"]]
+    increments = [float(row["linear solves"]) for row in finest]
+    coarse = [float(row["linear solves"]) for row in rollers if row not in finest]
+    coarser = report.number(max(coarse))
     refusals = " and ".join(report.number(row["linear solves"]) for row in refused)
     lines += report.text(
         *items,
@@ -133,6 +138,11 @@ def _cost(folder: Path) -> list[str]:
         f"{refusals} for the refusal of a load above the friction limit, on one and two ranks, in "
         "linear solves of the bodies tied at the contacts "
         "([all runs](benchmarks/bolted_joint/bolted_joint.csv))",
+        f"- **roller bearing**, ten bodies in sixteen contacts, {finest[0]['dofs']} dofs in the "
+        f"plane: {report.number(min(increments))} to {report.number(max(increments))} for one of "
+        f"{len(increments)} increments, in linear solves of the bodies tied, "
+        f"{sum(int(row['iterations']) for row in finest)} iterations in all; at most {coarser} "
+        "with coarser triangles ([all runs](benchmarks/bearing/bearing.csv))",
         '"Interior at the end": `increments(..., recover_interior="last")`. Newton iterations at '
         "large strains are in [finite.csv](benchmarks/finite/finite.csv).",
     )

@@ -250,15 +250,16 @@ class Equations:
     def regularised_tangents(self) -> Iterator[PETSc.Mat]:
         """Yield consistent tangents, regularised along unconstrained modes. Collective.
 
-        Slipping points of the bodies get the secant stiffness of friction, weighted by the
-        unbalanced fraction of the forces on the mode: a step along the mode is as long as the slip.
+        Slipping points of the bodies get the secant stiffness of friction, weighted by the largest
+        unbalanced fraction of the forces on a mode of their chain of bodies: a step along the mode
+        is as long as the slip. A loose body does not regularise others that it does not touch.
         Where slipping points would not constrain the body if they stuck, open points get the
         stiffness with which a step closes the nearest gap (`UnconstrainedModes.closing_stiffness`).
         Open points with a friction bound independent of the pressure slip. The regularisation
         vanishes with the residual: convergence remains superlinear (Levenberg-Marquardt).
         """
         full, modes = self.full, self._find_unconstrained_modes()
-        if modes is None or np.isnan(modes.imbalance).all():
+        if modes is None:
             self.regularised_modes = np.zeros((0, 0))
             yield from self.tangents()
             return
@@ -269,11 +270,11 @@ class Equations:
         within = [operator.within for operator in operators]
         stiffness = modes.closing_stiffness(self.motions, full.scales, full.operators, within)
         for number, (operator, closing) in enumerate(zip(operators, stiffness, strict=True)):
-            contact, group = operator.contact, full.scales.group_of_points(number)
+            contact, chain = operator.contact, modes.at_points[number]
             values, closed = contact.values, contact.status != Status.OPEN
-            slip_ratio = np.where(values.is_slipping, imbalance[group], 0.0)
-            open_ratio = np.where(closing < 1.0, closing, imbalance[group])
-            open_ratio[closed | ~modes.is_open[group]] = 0.0
+            slip_ratio = np.where(values.is_slipping, imbalance[chain], 0.0)
+            open_ratio = np.where(closing < 1.0, closing, imbalance[chain])
+            open_ratio[closed | ~modes.is_open[chain]] = 0.0
             tangent = contact.effective_law.tangent().scale(1.0 - slip_ratio)
             yield operator.tangent(tangent)
             normal = open_ratio + np.where(closed, slip_ratio, 0.0)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import scipy.linalg
 import scipy.sparse
+import scipy.sparse.csgraph
 from petsc4py import PETSc
 
 from fenics_contact.contact.contact import Contact
@@ -19,7 +20,7 @@ from fenics_contact.systems.rigid_motions import RigidMotions
 from fenics_contact.tolerances import FLAT, NEGLIGIBLE, ROUND_OFF
 from fenics_contact.types import Array, Index, Mask
 
-__all__ = ["RigidBodyModes", "tangential_gram"]
+__all__ = ["RigidBodyModes", "find_displaced", "tangential_gram"]
 
 
 class RigidBodyModes(RigidMotions):
@@ -86,6 +87,22 @@ class RigidBodyModes(RigidMotions):
         """Return which free modes move a common part, a mask (n_free, n_free)."""
         parts = np.hstack(self._moved_parts()).astype(np.float64)
         return np.asarray(parts @ parts.T > 0)
+
+    def find_chains(self, jumps: Sequence[Array]) -> Index:
+        """Return the chain of every free mode, (n_free,). Collective.
+
+        The modes of a chain move common parts, or have jumps at common points. Parts that only a
+        constrained one connects, as loose rollers in a ring, are in different chains.
+
+        Args:
+            jumps: Jumps of the free modes by contact, (n_free, n_points, gdim).
+        """
+        common: Array = np.zeros((len(self.free), len(self.free)))
+        for modes in jumps:
+            displaced = find_displaced(modes).astype(np.float64)
+            common += displaced @ displaced.T
+        linked = (global_sum(self.comm, common) > 0.0) | self.find_coupled_modes()
+        return np.asarray(scipy.sparse.csgraph.connected_components(linked)[1], dtype=np.intp)
 
     def find_body_modes(self) -> Mask:
         """Return which free modes move a body, a mask (n_free,)."""
@@ -207,15 +224,14 @@ class RigidBodyModes(RigidMotions):
         gram: Array = np.zeros((n_free, n_free))
         area: Array = np.zeros(n_free)
         same_body = self.find_coupled_modes().astype(np.float64)
-        for operator in operators:
+        jumps = [self.jumps_at(operator) for operator in operators]
+        for operator, modes in zip(operators, jumps, strict=True):
             contact, values = operator.contact, operator.contact.values
-            modes = self.jumps_at(operator)
             normal = np.einsum("mqd,qd->mq", modes, values.normal)
             weights = contact.quadrature.weights
             if closed_only:
                 weights = weights * (contact.status != Status.OPEN)
-            has_jump = np.abs(modes).max(axis=2, initial=0.0) > NEGLIGIBLE
-            area += ((same_body @ has_jump) > 0) @ contact.quadrature.weights
+            area += ((same_body @ find_displaced(modes)) > 0) @ contact.quadrature.weights
             if contact.law.has_normal_stiffness:
                 gram += (normal * weights) @ normal.T
             if slips:
@@ -223,7 +239,8 @@ class RigidBodyModes(RigidMotions):
                 modes = modes - np.einsum("mqd,qd->mq", modes, direction)[:, :, None] * direction
             gram += tangential_gram(contact, modes, closed_only=closed_only)
         gram, area = global_sum(self.comm, gram), global_sum(self.comm, area)
-        return self._null_space(gram, area, FLAT if slips else NEGLIGIBLE)
+        tolerance = FLAT if slips else NEGLIGIBLE
+        return self._null_space(gram, area, self.find_chains(jumps), tolerance)
 
     def find_unloaded(
         self,
@@ -247,8 +264,7 @@ class RigidBodyModes(RigidMotions):
         at_points = self.present_jumps(operators, self.present_matrix())
         for number, (operator, modes) in enumerate(zip(operators, at_points, strict=True)):
             contact, weights = operator.contact, operator.contact.quadrature.weights
-            has_jump = np.abs(modes).max(axis=2, initial=0.0) > NEGLIGIBLE
-            area += has_jump @ weights
+            area += find_displaced(modes) @ weights
             group = scales.group_of_points(number)
             for values in (state[number] for state in states):
                 if values is None:
@@ -262,7 +278,7 @@ class RigidBodyModes(RigidMotions):
                 lost = (values.paired > 0) & ~contact.pairs.paired
                 unknown[group[active.any(axis=0) & lost]] = 1.0
         gram, area, unknown = (global_sum(self.comm, part) for part in (gram, area, unknown))
-        modes = self._null_space(gram, area)
+        modes = self._null_space(gram, area, self.find_chains(at_points))
         return modes[~((modes != 0.0) @ (unknown[self.groups()] > 0.0))]
 
     def has_force(self, number: int, contact: Contact, values: PointValues) -> Mask:
@@ -276,20 +292,23 @@ class RigidBodyModes(RigidMotions):
         active = forces > self._scales.round_off_at_points(number, forces.max(axis=0))
         return np.asarray(active | (contact.law.has_tension & (values.paired > 0)))
 
-    def _null_space(self, gram: Array, area: Array, tolerance: float = NEGLIGIBLE) -> Array:
+    def _null_space(
+        self, gram: Array, area: Array, chain: Index, tolerance: float = NEGLIGIBLE
+    ) -> Array:
         """Return a basis of the null space of a Gram matrix, (n_modes, n_free). Collective.
 
         Args:
             gram: Products of the motions, weighted by area, (n_free, n_free).
             area: Area of the points at which each has a jump, (n_free,).
+            chain: Chain of each, (n_free,).
             tolerance: Mean square jump relative to the motion below which it is in the null space.
         """
         scale = 1 / np.sqrt(np.where(area > 0, area, 1.0))
         gram = gram * np.outer(scale, scale)
-        n, groups = len(area), self.groups()
+        n = len(area)
         basis = [np.zeros((0, n))]
-        for group in np.unique(groups):  # groups are decoupled
-            members = np.flatnonzero(groups == group)
+        for number in np.unique(chain):  # chains are decoupled
+            members = np.flatnonzero(chain == number)
             sizes, eigenvectors = np.linalg.eigh(gram[np.ix_(members, members)])
             vectors = np.zeros((np.count_nonzero(sizes < tolerance), n))
             vectors[:, members] = (eigenvectors * scale[members, None])[:, sizes < tolerance].T
@@ -349,6 +368,11 @@ class RigidBodyModes(RigidMotions):
             largest, self.groups()[self.find_state_independent_modes()], np.abs(resultants)
         )
         return largest
+
+
+def find_displaced(jumps: Array) -> Mask:
+    """Return which points modes displace, (n_modes, n_points), by jumps (n_modes, n_points, d)."""
+    return np.asarray(np.abs(jumps).max(axis=2, initial=0.0) > NEGLIGIBLE)
 
 
 def _without_round_off(work: Array, bound: Array) -> Array:
